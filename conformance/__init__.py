@@ -1,0 +1,1 @@
+"""The conformance kit: checks written once that judge any implementation through an adapter."""

@@ -1,0 +1,1 @@
+"""The adapters of our own columns. Each is imported only when it is asked for, so that no backend is needed for another."""

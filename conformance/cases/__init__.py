@@ -1,0 +1,31 @@
+"""The checks, one module for each row of the grid. Importing this package registers all of them."""
+
+from conformance.cases import (
+    agent,
+    behavior,
+    distributions,
+    layers,
+    networks,
+    optimizer,
+    replay,
+    returns,
+    rssm,
+    training_loop,
+    transforms,
+    world_model,
+)
+
+__all__ = [
+    "agent",
+    "behavior",
+    "distributions",
+    "layers",
+    "networks",
+    "optimizer",
+    "replay",
+    "returns",
+    "rssm",
+    "training_loop",
+    "transforms",
+    "world_model",
+]

@@ -1,0 +1,193 @@
+"""Checks, and what they are run with.
+
+A check is a function that takes a `Run`, computes what the reference says, and hands it to `run.expect` together with the name and the
+arguments of the candidate's function. It is written once and runs on any adapter. A check names the requirements that it covers and the
+functions that it needs; where the adapter does not offer one of these, the check is reported as not offered.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+import hypothesis
+import numpy as np
+
+DTYPES = ("float64", "float32", "bfloat16")
+EPSILON = {"float64": 2.0**-52, "float32": 2.0**-23, "bfloat16": 2.0**-7}
+SMALLEST_NORMAL = {"float64": 2.0**-1022, "float32": 2.0**-126, "bfloat16": 2.0**-126}
+# Rounding of one function, relative to the magnitude of what it sums. float64 is held to 1e-12; the others to multiples of their epsilon.
+BOUND = {"float64": 1e-12, "float32": 64 * EPSILON["float32"], "bfloat16": 16 * EPSILON["bfloat16"]}
+
+
+@dataclasses.dataclass(frozen=True)
+class Check:
+    """One registered check."""
+
+    name: str
+    requirements: tuple[str, ...]
+    uses: tuple[str, ...]
+    level: int
+    body: Callable[["Run"], None]
+    dtypes: tuple[str, ...]
+
+    @property
+    def summary(self) -> str:
+        return (self.body.__doc__ or "").strip().splitlines()[0]
+
+
+CHECKS: dict[str, Check] = {}
+
+
+def check(*requirements: str, uses: Iterable[str], level: int, dtypes: tuple[str, ...] = DTYPES) -> Callable[..., Any]:
+    """Registers a check under `row.function_name`. Its docstring says in one line what holds."""
+
+    def register(body: Callable[["Run"], None]) -> Callable[["Run"], None]:
+        name = f"{body.__module__.rsplit('.', 1)[-1]}.{body.__name__}"
+        if name in CHECKS:
+            raise ValueError(f"two checks are named {name}")
+        CHECKS[name] = Check(name, requirements, tuple(uses), level, body, dtypes)
+        return body
+
+    return register
+
+
+class Deviation(AssertionError):
+    """The candidate and the reference disagree."""
+
+
+@dataclasses.dataclass
+class Worst:
+    """The worst comparison of a check: deviation as a share of its bound, the deviation itself, and where."""
+
+    share: float = 0.0
+    deviation: float = 0.0
+    where: str = ""
+
+
+class Run:
+    """One check on one adapter.
+
+    dtype: precision of the candidate. profile: name of the profile that configurations are drawn from. seed and examples: of the drawn
+    cases. `compared` counts numbers compared, so that a check that compares nothing can be told from one that passes.
+    """
+
+    def __init__(self, adapter: object, dtype: str, profile: str, seed: int = 0, examples: int = 25) -> None:
+        self.adapter = adapter
+        self.dtype = dtype
+        self.profile = profile
+        self.seed = seed
+        self.examples = examples
+        self.worst = Worst()
+        self.compared = 0
+
+    def rng(self) -> np.random.Generator:
+        return np.random.default_rng(self.seed)
+
+    def cast(self, x: Any) -> np.ndarray:
+        """Rounds inputs to what the candidate's dtype can hold, so that reference and candidate start from the same numbers."""
+        return round_to(x, self.dtype)
+
+    def call(self, function: str, *args: Any) -> Any:
+        return getattr(self.adapter, function)(*args)
+
+    def expect(self, function: str, args: tuple[Any, ...], expected: Any, **how: Any) -> Any:
+        """Calls the candidate and compares its result; returns the result. `how` is passed to `compare`."""
+        actual = self.call(function, *args)
+        self.compare(function, actual, expected, **how)
+        return actual
+
+    def compare(
+        self, where: str, actual: Any, expected: Any, *, magnitude: Any = None, factor: float = 1.0, bound: float | None = None
+    ) -> None:
+        """Raises `Deviation` unless |actual - expected| <= bound * magnitude, elementwise, in every array of a nested result.
+
+        magnitude: what rounding is relative to. None: |expected| of each element; "tensor": the largest |expected| of the array; or an
+        array (for sums: the sum of the magnitudes of the terms). factor: multiplies the bound of the dtype, for longer computations.
+        bound: replaces it. NaN must meet NaN and an infinity the same infinity.
+        """
+        if isinstance(expected, Mapping):
+            if not isinstance(actual, Mapping) or set(actual) != set(expected):
+                got = sorted(actual) if isinstance(actual, Mapping) else type(actual).__name__
+                raise Deviation(f"{where}: expected the keys {sorted(expected)}, got {got}")
+            for key in expected:
+                part = magnitude[key] if isinstance(magnitude, Mapping) else magnitude
+                self.compare(f"{where}[{key}]", actual[key], expected[key], magnitude=part, factor=factor, bound=bound)
+        elif isinstance(expected, tuple):
+            if not isinstance(actual, tuple | list) or len(actual) != len(expected):
+                raise Deviation(f"{where}: expected {len(expected)} results, got {actual!r:.80}")
+            for index, (a, e) in enumerate(zip(actual, expected, strict=True)):
+                part = magnitude[index] if isinstance(magnitude, tuple) else magnitude
+                self.compare(f"{where}[{index}]", a, e, magnitude=part, factor=factor, bound=bound)
+        else:
+            self._compare_arrays(where, actual, expected, magnitude, BOUND[self.dtype] * factor if bound is None else bound)
+
+    def exact(self, where: str, actual: Any, expected: Any) -> None:
+        """Raises `Deviation` unless equal in every bit but the sign of zero."""
+        self._compare_arrays(where, actual, expected, 1.0, 0.0)
+
+    def holds(self, where: str, condition: Any) -> None:
+        """Raises `Deviation` unless the condition holds everywhere."""
+        self.compared += int(np.size(condition))
+        if not np.all(condition):
+            self.worst = Worst(math.inf, math.inf, where)
+            raise Deviation(f"{where} does not hold")
+
+    def for_all(self, **strategies: Any) -> Callable[[Callable[..., None]], None]:
+        """Decorator: runs the function on cases drawn by hypothesis, and shrinks the first that deviates."""
+
+        def decorate(body: Callable[..., None]) -> None:
+            wrapped = hypothesis.given(**strategies)(body)
+            wrapped = hypothesis.settings(
+                max_examples=self.examples, deadline=None, database=None, suppress_health_check=list(hypothesis.HealthCheck)
+            )(wrapped)
+            hypothesis.seed(self.seed)(wrapped)()
+
+        return decorate
+
+    def _compare_arrays(self, where: str, actual: Any, expected: Any, magnitude: Any, bound: float) -> None:
+        actual = np.asarray(actual, np.float64)
+        expected = np.asarray(expected, np.float64)
+        if actual.shape != expected.shape:
+            self.worst = Worst(math.inf, math.inf, where)
+            raise Deviation(f"{where}: expected shape {expected.shape}, got {actual.shape}")
+        self.compared += expected.size
+        if not expected.size:
+            return
+        deviation = relative_deviation(actual, expected, magnitude, SMALLEST_NORMAL[self.dtype] / EPSILON[self.dtype])
+        index = np.unravel_index(np.argmax(deviation), deviation.shape)
+        largest = float(deviation[index])
+        share = largest / bound if bound else (0.0 if largest == 0 else math.inf)
+        place = f"{where}[{', '.join(map(str, index))}]" if index else where
+        if share > self.worst.share or not self.worst.where:
+            self.worst = Worst(share, largest, place)
+        if share > 1:
+            raise Deviation(f"{place}: got {actual[index]!r}, expected {expected[index]!r}, off by {largest:.3g}, allowed {bound:.3g}")
+
+
+def relative_deviation(actual: np.ndarray, expected: np.ndarray, magnitude: Any, floor: float) -> np.ndarray:
+    """|actual - expected| / magnitude, with infinity where only one is NaN or infinities differ."""
+    with np.errstate(all="ignore"):
+        if magnitude is None:
+            magnitude = np.abs(expected)
+        elif isinstance(magnitude, str):
+            magnitude = np.max(np.abs(expected), where=np.isfinite(expected), initial=0.0)
+        scale = np.maximum(np.broadcast_to(np.asarray(magnitude, np.float64), expected.shape), floor)
+        scale = np.where(np.isfinite(scale), scale, 1.0)
+        difference = np.abs(actual - expected) / scale
+    same = (actual == expected) | (np.isnan(actual) & np.isnan(expected))
+    return np.where(same, 0.0, np.where(np.isfinite(difference), difference, np.inf))
+
+
+def round_to(x: Any, dtype: str) -> np.ndarray:
+    """x as float64, rounded to what `dtype` can hold."""
+    x = np.asarray(x, np.float64)
+    if dtype == "float64":
+        return x
+    with np.errstate(all="ignore"):
+        x32 = x.astype(np.float32)
+    if dtype == "float32":
+        return x32.astype(np.float64)
+    bits = np.atleast_1d(x32).view(np.uint32).astype(np.uint64)
+    rounded = ((bits + 0x7FFF + ((bits >> 16) & 1)) & 0xFFFF0000).astype(np.uint32).view(np.float32).reshape(x.shape)
+    return np.where(np.isfinite(x32), rounded, x32).astype(np.float64)

@@ -1,0 +1,42 @@
+"""What the cases are drawn from: numbers that break implementations, and arrays of them."""
+
+from typing import Any
+
+import hypothesis.strategies as st
+import numpy as np
+
+BIN_EDGE = float(np.expm1(20.0))
+
+
+def adversarial_numbers(finite: bool = False) -> st.SearchStrategy[float]:
+    """Both zeros, subnormals, ordinary, huge, bin edges and their float neighbours, and unless `finite` the infinities and NaN."""
+    special = [0.0, -0.0, 1e-45, -1e-45, 1e-310, 1e-38, 1.0, -1.0, 1e-8, 0.1, 300.0, 1e30, -1e30, 3e38, -3e38]
+    edges = [sign * float(np.nextafter(BIN_EDGE, towards)) for sign in (1, -1) for towards in (0.0, BIN_EDGE, 1e300)]
+    choices = [
+        st.sampled_from(special + edges),
+        st.floats(-1e9, 1e9, allow_nan=False, width=32),
+        st.floats(-3, 3, allow_nan=False, width=32),
+    ]
+    if not finite:
+        choices.append(st.sampled_from([np.inf, -np.inf, np.nan]))
+    return st.one_of(choices)
+
+
+@st.composite
+def arrays(draw: Any, elements: st.SearchStrategy[float], shape: tuple[int, ...]) -> np.ndarray:
+    """A float64 array whose every element is drawn."""
+    size = int(np.prod(shape))
+    return np.array(draw(st.lists(elements, min_size=size, max_size=size)), np.float64).reshape(shape)
+
+
+def seeds() -> st.SearchStrategy[int]:
+    """For arrays too large to draw number by number: a seed that hypothesis varies."""
+    return st.integers(0, 2**32 - 1)
+
+
+def normals(seed: int, *shape: int, scale: float = 1.0) -> np.ndarray:
+    return np.random.default_rng(seed).normal(0.0, scale, shape)
+
+
+def shapes(max_rank: int = 3, max_side: int = 4) -> st.SearchStrategy[tuple[int, ...]]:
+    return st.lists(st.integers(1, max_side), min_size=0, max_size=max_rank).map(tuple)
