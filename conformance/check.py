@@ -81,6 +81,16 @@ class Run:
         self.worst = Worst()
         self.compared = 0
 
+    @property
+    def u(self) -> float:
+        """Distance from 1 to the next number in the precision of losses, returns and transforms: float32 or better."""
+        return EPSILON["float64" if self.dtype == "float64" else "float32"]
+
+    @property
+    def tiny(self) -> float:
+        """Smallest normal number of that precision."""
+        return SMALLEST_NORMAL["float64" if self.dtype == "float64" else "float32"]
+
     def rng(self) -> np.random.Generator:
         return np.random.default_rng(self.seed)
 
@@ -133,6 +143,17 @@ class Run:
             self.worst = Worst(math.inf, math.inf, where)
             raise Deviation(f"{where} does not hold")
 
+    def refuses(self, function: str, *args: Any) -> None:
+        """Raises `Deviation` unless the candidate raises a ValueError with a message."""
+        self.compared += 1
+        try:
+            result = self.call(function, *args)
+        except ValueError as error:
+            self.holds(f"the error message of {function}", bool(str(error)))
+            return
+        self.worst = Worst(math.inf, math.inf, function)
+        raise Deviation(f"{function} must raise a ValueError for {_brief(args)}, and returned {_brief(result)}")
+
     def for_all(self, **strategies: Any) -> Callable[[Callable[..., None]], None]:
         """Decorator: runs the function on cases drawn by hypothesis, and shrinks the first that deviates."""
 
@@ -163,6 +184,11 @@ class Run:
             self.worst = Worst(share, largest, place)
         if share > 1:
             raise Deviation(f"{place}: got {actual[index]!r}, expected {expected[index]!r}, off by {largest:.3g}, allowed {bound:.3g}")
+
+
+def _brief(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 120 else text[:117] + "..."
 
 
 def relative_deviation(actual: np.ndarray, expected: np.ndarray, magnitude: Any, floor: float) -> np.ndarray:

@@ -1,0 +1,97 @@
+"""The command `conformance`."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+from rich.console import Console
+from rich.table import Table
+
+from conformance.adapter import COLUMNS, load_adapter
+from conformance.check import DTYPES
+from conformance.coverage import coverage
+from conformance.execute import Result, rows, run_check, selected_checks
+from conformance.requirements import requirements
+from spec import profiles
+
+STYLE = {"pass": "green", "fail": "bold red", "error": "bold red", "not offered": "yellow"}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Returns 0 when everything that was asked holds, 1 when it does not, 2 for a wrong command line."""
+    parser = argparse.ArgumentParser(prog="conformance", description="Checks an implementation of DreamerV3 against the specification.")
+    commands = parser.add_subparsers(dest="command", required=True)
+    run = commands.add_parser("run", help="run the checks on a backend", formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    run.add_argument("--backend", choices=COLUMNS, required=True, help="which column of the grid to check")
+    run.add_argument("--dtype", choices=DTYPES, default="float64", help="precision of the backend")
+    run.add_argument("--device", default=None, help="device of the backend, as the backend names it: cpu, cuda, gpu, ...")
+    run.add_argument("--profile", choices=tuple(profiles()), default="paper", help="profile of the configurations")
+    run.add_argument("--only", default="", help="only checks whose name or requirement id contains this")
+    run.add_argument("--seed", type=int, default=0, help="seed of the drawn cases")
+    run.add_argument("--examples", type=int, default=25, help="cases that hypothesis draws for each property")
+    commands.add_parser("coverage", help="list every requirement and the checks that cover it; fails if one has none")
+    options = parser.parse_args(arguments)
+    console = Console(width=None if sys.stdout.isatty() else 150)
+    return _coverage(console) if options.command == "coverage" else _run(console, options)
+
+
+def _run(console: Console, options: argparse.Namespace) -> int:
+    try:
+        adapter = load_adapter(options.backend, options.dtype, options.device)
+    except ImportError as error:
+        print(f"conformance: error: {error}; install it with: pip install 'dreamer-spec[{options.backend}]'", file=sys.stderr)
+        return 2
+    checks = selected_checks(options.dtype, options.only)
+    if not checks:
+        print(f"conformance: error: no check matches --only {options.only!r}", file=sys.stderr)
+        return 2
+    results: list[Result] = []
+    with console.status("checking") as status:
+        for number, check in enumerate(checks, 1):
+            status.update(f"{number}/{len(checks)} {check.name}")
+            results.append(run_check(check, adapter, options.dtype, options.profile, options.seed, options.examples))
+    _print_run(console, results, options)
+    return 0 if all(result.status in ("pass", "not offered") for result in results) and any(r.status == "pass" for r in results) else 1
+
+
+def _print_run(console: Console, results: list[Result], options: argparse.Namespace) -> None:
+    table = Table(title=f"{options.backend}, {options.dtype}, profile {options.profile}, seed {options.seed}", title_justify="left")
+    for column in ("requirement", "checks", "worst deviation", "of allowed", "where", "result"):
+        table.add_column(column, overflow="fold")
+    for row in rows(results):
+        worst = row.worst
+        table.add_row(
+            row.requirement,
+            str(len(row.results)),
+            f"{worst.deviation:.1e}",
+            f"{worst.share:.0%}" if worst.share < 1e6 else "-",
+            worst.where,
+            f"[{STYLE[row.status]}]{row.status}",
+        )
+    console.print(table)
+    for result in results:
+        if result.status in ("fail", "error"):
+            console.print(f"[bold red]{result.check.name}[/] ({', '.join(result.check.requirements)}): {result.check.summary}")
+            console.print(result.message, markup=False, highlight=False)
+    counts = {status: sum(result.status == status for result in results) for status in STYLE}
+    numbers = sum(result.compared for result in results)
+    console.print(f"{len(results)} checks, {numbers:,} numbers compared: " + ", ".join(f"{count} {name}" for name, count in counts.items()))
+
+
+def _coverage(console: Console) -> int:
+    table, problems = coverage()
+    view = Table()
+    for column in ("requirement", *COLUMNS, "text"):
+        view.add_column(column, no_wrap=column == "text", overflow="ellipsis" if column == "text" else "fold")
+    for requirement, columns in table.items():
+        counts = (str(len(columns[column])) if column in columns else "-" for column in COLUMNS)
+        view.add_row(requirement, *counts, requirements()[requirement].replace("[", r"\["))
+    console.print(view)
+    for problem in problems:
+        console.print(f"[bold red]{problem}")
+    console.print(f"{len(table)} requirements, {len(problems)} problems")
+    return 1 if problems or not table else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,85 @@
+"""Runs checks on an adapter and sums the results up by requirement."""
+
+import dataclasses
+import traceback
+from collections.abc import Iterable
+
+from conformance.check import CHECKS, Check, Deviation, Run, Worst
+from conformance.requirements import requirements
+
+
+@dataclasses.dataclass(frozen=True)
+class Result:
+    """What one check found. status: "pass", "fail", "error" (the candidate raised) or "not offered"."""
+
+    check: Check
+    status: str
+    worst: Worst
+    compared: int
+    message: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """What all checks of one requirement found."""
+
+    requirement: str
+    results: tuple[Result, ...]
+
+    @property
+    def status(self) -> str:
+        statuses = {result.status for result in self.results}
+        for status in ("error", "fail", "not offered"):
+            if status in statuses:
+                return status
+        return "pass" if self.results else "no check"
+
+    @property
+    def worst(self) -> Worst:
+        return max((result.worst for result in self.results), key=lambda worst: worst.share, default=Worst())
+
+
+def offered(adapter: object, check: Check) -> bool:
+    return all(hasattr(adapter, name) for name in check.uses)
+
+
+def run_check(check: Check, adapter: object, dtype: str, profile: str, seed: int = 0, examples: int = 25) -> Result:
+    """Runs one check; what the candidate raises becomes a result."""
+    if not offered(adapter, check):
+        missing = ", ".join(name for name in check.uses if not hasattr(adapter, name))
+        return Result(check, "not offered", Worst(), 0, f"the adapter does not offer {missing}")
+    run = Run(adapter, dtype, profile, seed, examples)
+    try:
+        check.body(run)
+    except Deviation as deviation:
+        return Result(check, "fail", run.worst, run.compared, str(deviation))
+    except Exception:
+        return Result(check, "error", Worst(float("inf"), float("inf"), check.name), run.compared, traceback.format_exc(limit=-4))
+    if not run.compared:
+        return Result(check, "error", run.worst, 0, "the check compared nothing")
+    return Result(check, "pass", run.worst, run.compared)
+
+
+def selected_checks(dtype: str, only: str = "") -> list[Check]:
+    """The checks that apply at a dtype and whose name or requirement ids contain `only`."""
+    import conformance.cases  # noqa: F401 - importing registers the checks
+
+    return [
+        check
+        for check in sorted(CHECKS.values(), key=lambda check: (check.level, check.name))
+        if dtype in check.dtypes and (only in check.name or any(only in requirement for requirement in check.requirements))
+    ]
+
+
+def run_checks(adapter: object, dtype: str, profile: str, seed: int = 0, examples: int = 25, only: str = "") -> Iterable[Result]:
+    for check in selected_checks(dtype, only):
+        yield run_check(check, adapter, dtype, profile, seed, examples)
+
+
+def rows(results: Iterable[Result]) -> list[Row]:
+    """The results by requirement, in the order of the chapters; requirements that none of the checks names are left out."""
+    results = list(results)
+    found = [
+        Row(requirement, tuple(result for result in results if requirement in result.check.requirements)) for requirement in requirements()
+    ]
+    return [row for row in found if row.results]

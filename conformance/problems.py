@@ -1,0 +1,175 @@
+"""Small problems for the checks: spaces, configurations, parameters, batches and noise, drawn from a seed.
+
+They are small but nothing in them is degenerate: sides, sizes and channel counts differ from each other, every parameter is random (the
+reward and critic outputs too, which start at zero in training), episodes begin, end and are cut inside the sequences.
+"""
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+
+from conformance.check import round_to
+from spec import Config, Discrete, Image, Spaces, Vector, load_config, parameter_table
+
+OBSERVATIONS = {
+    "vector": {"position": Vector(3), "mode": Discrete((3, 2))},
+    "image": {"image": Image(16, 32, 3)},
+    "both": {"position": Vector(3), "mode": Discrete((3, 2)), "image": Image(16, 32, 3), "depth": Image(16, 32, 1)},
+}
+ACTIONS = {
+    "discrete": {"action": Discrete((4,))},
+    "continuous": {"action": Vector(3)},
+    "mixed": {"arm": Vector(2), "buttons": Discrete((2, 3))},
+}
+SMALL = {
+    "units": 8,
+    "deter": 16,
+    "stoch": 3,
+    "classes": 5,
+    "cnn_depth": 2,
+    "bins": 31,
+    "batch_size": 2,
+    "batch_length": 5,
+    "imagination_horizon": 3,
+    "warmup_steps": 10,
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Problem:
+    """Everything that a training step takes."""
+
+    spaces: Spaces
+    config: Config
+    state: dict[str, Any]
+    batch: dict[str, np.ndarray]
+    noise: dict[str, np.ndarray]
+
+    @property
+    def loss_arguments(self) -> tuple[Any, ...]:
+        """The arguments of `losses` and `gradients`."""
+        state = self.state
+        return state["params"], state["slow_critic"], state["return_range"], self.batch, self.noise, self.spaces, self.config
+
+
+def spaces(observation: str = "both", action: str = "mixed") -> Spaces:
+    return Spaces(OBSERVATIONS[observation], ACTIONS[action])
+
+
+def small_config(profile: str, dtype: str = "float64", **overrides: Any) -> Config:
+    """A configuration of the profile, with sizes that the reference computes in milliseconds."""
+    return load_config(profile, "tiny", compute_dtype=dtype, **{**SMALL, **overrides})
+
+
+def random_parameters(rng: np.random.Generator, config: Config, task: Spaces, dtype: str = "float64") -> dict[str, np.ndarray]:
+    """Every entry of the table, none of them zero or one."""
+    params = {}
+    for name, entry in parameter_table(config, task).items():
+        if entry.initializer == "truncated_normal":
+            value = rng.normal(0.0, 1 / math.sqrt(entry.fan_in), entry.shape)
+        else:
+            value = rng.normal(float(entry.initializer == "ones"), 0.2, entry.shape)
+        params[name] = round_to(value, "float32" if dtype == "bfloat16" else dtype)
+    return params
+
+
+def random_observations(rng: np.random.Generator, task: Spaces, leading: tuple[int, ...]) -> dict[str, np.ndarray]:
+    """Observations with the given leading axes; vectors are float32 numbers of several magnitudes."""
+    observations: dict[str, np.ndarray] = {}
+    for key, space in task.observations.items():
+        shape = (*leading, *space.array_shape)
+        if isinstance(space, Vector):
+            observations[key] = (rng.normal(size=shape) * 10 ** rng.uniform(-2, 2, shape)).astype(np.float32)
+        elif isinstance(space, Discrete):
+            observations[key] = rng.integers(0, space.classes, shape)
+        else:
+            observations[key] = rng.integers(0, 256, shape).astype(np.uint8)
+    return observations
+
+
+def random_actions(rng: np.random.Generator, task: Spaces, leading: tuple[int, ...]) -> np.ndarray:
+    """Flat actions: one-hots, and real numbers some of which lie outside [-1, 1]."""
+    parts = []
+    for space in task.actions.values():
+        if isinstance(space, Discrete):
+            parts += [np.eye(classes)[rng.integers(0, classes, leading)] for classes in space.classes]
+        else:
+            parts.append(round_to(rng.normal(size=(*leading, space.size)), "bfloat16"))
+    return np.concatenate(parts, -1)
+
+
+def random_carry(rng: np.random.Generator, config: Config, leading: tuple[int, ...]) -> dict[str, np.ndarray]:
+    """h in (-1, 1) and one-hot z."""
+    stoch = np.eye(config.classes)[rng.integers(0, config.classes, (*leading, config.stoch))]
+    return {"deter": round_to(np.tanh(rng.normal(size=(*leading, config.deter))), "bfloat16"), "stoch": stoch}
+
+
+def random_batch(rng: np.random.Generator, config: Config, task: Spaces) -> dict[str, np.ndarray]:
+    """A replay batch. Row 0 holds a termination followed by a reset, row 1 a truncation, and the last row ends in a terminal step."""
+    B, T = config.batch_size, config.batch_length
+    is_last = np.zeros((B, T), bool)
+    is_terminal = np.zeros((B, T), bool)
+    is_first = np.zeros((B, T), bool)
+    is_last[0, T // 2] = is_terminal[0, T // 2] = is_last[1 % B, T // 3] = is_last[-1, -1] = is_terminal[-1, -1] = True
+    is_first[:, 1:] = is_last[:, :-1]
+    carry = random_carry(rng, config, (B,))
+    reward = np.where(is_first, 0, rng.normal(size=(B, T)) * 10 ** rng.uniform(-1, 2, (B, T)))
+    return {
+        **random_observations(rng, task, (B, T)),
+        "reward": reward.astype(np.float32),
+        "is_first": is_first,
+        "is_last": is_last,
+        "is_terminal": is_terminal,
+        "prev_action": random_actions(rng, task, (B, T)).astype(np.float32),
+        "deter": carry["deter"].astype(np.float32),
+        "stoch": carry["stoch"].argmax(-1),
+    }
+
+
+def action_noise(rng: np.random.Generator, task: Spaces, leading: tuple[int, ...]) -> np.ndarray:
+    """[..., K]: normals for real numbers, uniforms for categoricals, in the order of the keys."""
+    parts = []
+    for space in task.actions.values():
+        shape = (*leading, *space.array_shape)
+        parts.append(rng.random(shape) if isinstance(space, Discrete) else rng.normal(size=shape))
+    return round_to(np.concatenate(parts, -1), "float32")
+
+
+def uniforms(rng: np.random.Generator, *shape: int) -> np.ndarray:
+    """Uniforms in [0, 1) that every dtype of the noise can hold."""
+    return rng.integers(0, 2**23, shape) / 2.0**23
+
+
+def train_noise(rng: np.random.Generator, config: Config, task: Spaces) -> dict[str, np.ndarray]:
+    B, T, H, S = config.batch_size, config.batch_length, config.imagination_horizon, config.stoch
+    return {
+        "posterior": uniforms(rng, B, T, S),
+        "prior": uniforms(rng, B * T, H, S),
+        "action": action_noise(rng, task, (B * T, H)),
+    }
+
+
+def random_state(rng: np.random.Generator, config: Config, task: Spaces, dtype: str = "float64") -> dict[str, Any]:
+    """A training state in the middle of training: moments, a slow critic and a return range of their own, ten updates made."""
+    stored = "float32" if dtype == "bfloat16" else dtype
+    params = random_parameters(rng, config, task, dtype)
+    return {
+        "params": params,
+        "slow_critic": {
+            name: round_to(value + rng.normal(0, 0.05, value.shape), stored) for name, value in params.items() if name.startswith("critic/")
+        },
+        "optimizer": {
+            "step": 10,
+            "second_moment": {name: round_to(rng.uniform(0.01, 1, value.shape), stored) for name, value in params.items()},
+            "momentum": {name: round_to(rng.normal(0, 1, value.shape), stored) for name, value in params.items()},
+        },
+        "return_range": {"low": round_to(-0.75, stored), "high": round_to(1.5, stored)},
+    }
+
+
+def make_problem(seed: int, profile: str, observation: str, action: str, dtype: str = "float64", **overrides: Any) -> Problem:
+    rng = np.random.default_rng(seed)
+    config, task = small_config(profile, dtype, **overrides), spaces(observation, action)
+    return Problem(task, config, random_state(rng, config, task, dtype), random_batch(rng, config, task), train_noise(rng, config, task))
