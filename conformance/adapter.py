@@ -6,17 +6,18 @@ Parameters are the flat mapping of canonical names (spec/parameters.py), a state
 """
 
 import importlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
 
 from conformance.check import DTYPES
-from spec import Config, Spaces
+from spec import Config, Parameter, Spaces
 
 Array = np.ndarray
 Arrays = Mapping[str, np.ndarray]
 Nested = Mapping[str, Any]
+Range = tuple[float, float]
 
 
 class Adapter(Protocol):
@@ -111,6 +112,8 @@ class Adapter(Protocol):
     def optimizer_step(self, params: Arrays, gradients: Arrays, state: Nested, config: Config) -> tuple[Arrays, Nested]: ...
 
     # agent
+    def initial_parameters(self, table: Mapping[str, Parameter], uniforms: Arrays) -> Arrays: ...
+    def initial_state(self, params: Arrays) -> Nested: ...
     def policy_step(
         self,
         params: Arrays,
@@ -123,28 +126,36 @@ class Adapter(Protocol):
         config: Config,
     ) -> tuple[Arrays, Array]: ...
     def losses(
-        self, params: Arrays, slow_critic: Arrays, return_range: Nested, batch: Arrays, noise: Arrays, spaces: Spaces, config: Config
+        self, params: Arrays, slow_critic: Arrays, return_range: Range, batch: Arrays, noise: Arrays, spaces: Spaces, config: Config
     ) -> tuple[float, Nested]: ...
-    def gradients(
-        self, params: Arrays, slow_critic: Arrays, return_range: Nested, batch: Arrays, noise: Arrays, spaces: Spaces, config: Config
-    ) -> Arrays:
-        """d total / d params of `losses`."""
-
-    def loss_derivative(
+    def loss_derivatives(
         self,
         params: Arrays,
         slow_critic: Arrays,
-        return_range: Nested,
+        return_range: Range,
         batch: Arrays,
         noise: Arrays,
         spaces: Spaces,
         config: Config,
-        direction: Arrays,
-    ) -> float:
-        """The derivative of the total loss along `direction`: the inner product with `gradients`."""
+        directions: Sequence[Arrays],
+    ) -> Arrays:
+        """Loss name -> [directions]: the derivative of each unweighted mean loss along each direction in parameter space.
+
+        A direction names the parameters that move; with automatic differentiation this is the inner product with the loss's gradient.
+        """
+
+    def gradients(
+        self, params: Arrays, slow_critic: Arrays, return_range: Range, batch: Arrays, noise: Arrays, spaces: Spaces, config: Config
+    ) -> Arrays:
+        """d total / d params of `losses`, by name."""
 
     def train_step(self, state: Nested, batch: Arrays, noise: Arrays, spaces: Spaces, config: Config) -> tuple[Nested, Nested]:
-        """One whole training step with the candidate's own gradients: (new state, aux)."""
+        """One whole training step with the candidate's own gradients: (new state, aux of `losses`)."""
+
+    def train_step_with(
+        self, state: Nested, batch: Arrays, noise: Arrays, gradients: Arrays, spaces: Spaces, config: Config
+    ) -> tuple[Nested, Nested]:
+        """The same with given gradients, for implementations without automatic differentiation."""
 
     # replay and training loop: classes with the methods of the reference
     Replay: Any

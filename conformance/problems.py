@@ -51,7 +51,8 @@ class Problem:
     def loss_arguments(self) -> tuple[Any, ...]:
         """The arguments of `losses` and `gradients`."""
         state = self.state
-        return state["params"], state["slow_critic"], state["return_range"], self.batch, self.noise, self.spaces, self.config
+        return_range = (state["return_range"]["low"], state["return_range"]["high"])
+        return state["params"], state["slow_critic"], return_range, self.batch, self.noise, self.spaces, self.config
 
 
 def spaces(observation: str = "both", action: str = "mixed") -> Spaces:
@@ -165,7 +166,7 @@ def random_state(rng: np.random.Generator, config: Config, task: Spaces, dtype: 
             "second_moment": {name: round_to(rng.uniform(0.01, 1, value.shape), stored) for name, value in params.items()},
             "momentum": {name: round_to(rng.normal(0, 1, value.shape), stored) for name, value in params.items()},
         },
-        "return_range": {"low": round_to(-0.75, stored), "high": round_to(1.5, stored)},
+        "return_range": {"low": -0.75, "high": 1.5},
     }
 
 

@@ -3,7 +3,6 @@
 from typing import Any
 
 import numpy as np
-from reference_numpy.agent import directional_derivative
 
 from reference_numpy import (
     agent,
@@ -23,10 +22,16 @@ from reference_numpy import (
 ROWS = (transforms, distributions, layers, rssm, networks, world_model, returns, behavior, optimizer, agent, replay, training_loop)
 
 
+# Unit directions: the error of the difference is about 1e-11 times the loss.
+DIFFERENCE_STEP = 1e-5
+
+
 class NumpyAdapter:
     """Offers every public function of reference_numpy under its name, looked up at each call so that a mutant takes effect."""
 
     def __getattr__(self, name: str) -> Any:
+        if name in ("gradients", "train_step"):
+            raise AttributeError(f"the reference has no automatic differentiation, so it cannot offer {name}")
         for row in ROWS:
             if not name.startswith("_") and name in vars(row):
                 return getattr(row, name)
@@ -35,13 +40,20 @@ class NumpyAdapter:
     def imagine(self, params: Any, carry: Any, action: np.ndarray, uniform: np.ndarray, config: Any) -> Any:
         return rssm.imagine(params, carry, lambda feature, t: action[:, t], uniform, config)
 
-    def loss_derivative(
-        self, params: Any, slow_critic: Any, return_range: Any, batch: Any, noise: Any, spaces: Any, config: Any, direction: Any
-    ) -> float:
-        def total(point: Any) -> float:
-            return agent.losses(point, slow_critic, return_range, batch, noise, spaces, config)[0]
+    def loss_derivatives(self, params: Any, *arguments: Any) -> Any:
+        *others, directions = arguments
+        names: list[str] = []
 
-        return directional_derivative(total, params, direction, 1e-6)
+        def means(point: Any) -> np.ndarray:
+            losses = agent.losses(point, *others)[1]["losses"]
+            names[:] = losses
+            return np.array(list(losses.values()))
+
+        columns = [agent.directional_derivative(means, params, direction, DIFFERENCE_STEP) for direction in directions]
+        return dict(zip(names, np.array(columns).T, strict=True))
+
+    def train_step_with(self, *arguments: Any) -> Any:
+        return agent.train_step(*arguments)
 
 
 def make_adapter(dtype: str, device: str | None) -> NumpyAdapter:
