@@ -65,11 +65,15 @@ def small_config(profile: str, dtype: str = "float64", **overrides: Any) -> Conf
 
 
 def random_parameters(rng: np.random.Generator, config: Config, task: Spaces, dtype: str = "float64") -> dict[str, np.ndarray]:
-    """Every entry of the table, none of them zero or one."""
+    """Every entry of the table, none of them zero or one.
+
+    The latents' logits are spread out, so that some KL divergences lie above the free nats and some below.
+    """
     params = {}
     for name, entry in parameter_table(config, task).items():
         if entry.initializer == "truncated_normal":
-            value = rng.normal(0.0, 1 / math.sqrt(entry.fan_in), entry.shape)
+            spread = 3.0 if name in ("rssm/posterior/out/kernel", "rssm/prior/out/kernel") else 1.0
+            value = rng.normal(0.0, spread / math.sqrt(entry.fan_in), entry.shape)
         else:
             value = rng.normal(float(entry.initializer == "ones"), 0.2, entry.shape)
         params[name] = round_to(value, "float32" if dtype == "bfloat16" else dtype)

@@ -1,0 +1,162 @@
+"""The losses of the world model, one value per loss and time step. Chapter: spec/06-world-model.md."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reference_numpy import networks, rssm
+from reference_numpy.distributions import (
+    bernoulli_loss,
+    categorical_kl,
+    categorical_log_prob,
+    mse_loss,
+    symexp_twohot_loss,
+    symlog_mse_loss,
+    unimix_log_probs,
+)
+from reference_numpy.observations import one_hots, scaled_image
+from reference_numpy.shapes import checked, require_shape
+from reference_numpy.stop_gradient import stop_gradient
+from reference_numpy.transforms import exponential_bins
+from spec.config import Config
+from spec.spaces import Discrete, Image, Spaces
+
+Array = NDArray[np.float64]
+
+
+def continue_target(is_terminal: Any, config: Config) -> Array:
+    """What the continue head learns. Implements [WM-7].
+
+    Paper: World model learning ("continuation flags"); D-06.
+
+    Args:
+      is_terminal: [...] bool, true terminations only.
+
+    Returns:
+      [...]: 0 at terminations; elsewhere 1, or the discount if `continue_target` is "discounted".
+    """
+    going_on = 1.0 - np.asarray(is_terminal, dtype=bool)
+    return going_on * config.discount if config.continue_target == "discounted" else going_on
+
+
+def kl_losses(posterior_logits: Any, prior_logits: Any, config: Config) -> tuple[Array, Array]:
+    """Dynamics and representation loss, in nats. Implements [WM-10] to [WM-14], [WM-18], [WM-19].
+
+    Paper: World model learning (L_dyn, L_rep, free bits); D-18 to D-21, D-23.
+
+    Args:
+      posterior_logits: [..., S, C], before the uniform mixture.
+      prior_logits: [..., S, C], before the uniform mixture.
+
+    Returns:
+      dynamics [...] and representation [...], each at least `free_nats`.
+
+    Raises:
+      ValueError: a shape does not fit.
+    """
+    posterior_logits = checked("posterior_logits", posterior_logits, ..., config.stoch, config.classes)
+    prior_logits = checked("prior_logits", prior_logits, *posterior_logits.shape)
+    posterior = unimix_log_probs(posterior_logits, config.latent_unimix)
+    prior = unimix_log_probs(prior_logits, config.latent_unimix)
+    dynamics = categorical_kl(stop_gradient(posterior), prior).sum(axis=-1)
+    representation = categorical_kl(posterior, stop_gradient(prior)).sum(axis=-1)
+    return np.maximum(config.free_nats, dynamics), np.maximum(config.free_nats, representation)
+
+
+def reconstruction_losses(
+    predictions: Mapping[str, Any], observations: Mapping[str, Any], spaces: Spaces, config: Config
+) -> dict[str, Array]:
+    """How badly each observation was reconstructed. Implements [WM-2] to [WM-5], [WM-17], [WM-19].
+
+    Paper: Robust predictions (vectors); D-14 to D-17.
+
+    Args:
+      predictions: output of the decoder: Vector [..., size] in symlog space, Discrete [..., sum of classes], Image [..., height, width,
+        channels].
+      observations: raw observations by key, each [..., *array_shape]; other keys are ignored.
+
+    Returns:
+      By observation key: [...], summed over everything that belongs to one observation.
+
+    Raises:
+      ValueError: a key is missing, or a shape, dtype or Discrete value does not fit.
+    """
+    losses = {}
+    for key, space in spaces.observations.items():
+        for name, mapping in (("predictions", predictions), ("observations", observations)):
+            if key not in mapping:
+                raise ValueError(f"{name}: the key {key!r} is missing; got {sorted(mapping)}")
+        name = f"prediction of {key!r}"
+        if isinstance(space, Image):
+            target = scaled_image(key, observations[key])
+            prediction = checked(name, predictions[key], ..., *space.array_shape)
+            require_shape(f"observation {key!r}", target.shape, *prediction.shape)
+            losses[key] = mse_loss(prediction, target).sum(axis=(-3, -2, -1))
+        elif isinstance(space, Discrete):
+            target = one_hots(key, observations[key], space)
+            logits = checked(name, predictions[key], *target.shape)
+            losses[key] = _cross_entropy(logits, target, space)
+        else:
+            target = checked(f"observation {key!r}", observations[key], ..., space.size)
+            prediction = checked(name, predictions[key], *target.shape)
+            losses[key] = symlog_mse_loss(prediction, target, config.vector_loss_scale).sum(axis=-1)
+    return losses
+
+
+def world_model_losses(
+    params: Mapping[str, Any], batch: Mapping[str, Any], states: Mapping[str, Any], spaces: Spaces, config: Config
+) -> dict[str, Array]:
+    """Every loss of the world model at every time step, without weights.
+
+    Implements [WM-1], [WM-6], [WM-8], [WM-9], [WM-15], [WM-16], [WM-19].
+
+    Paper: World model learning (L_pred, L_dyn, L_rep); D-12, D-13, D-91, D-134, D-135.
+
+    Args:
+      params: `rssm/prior/...`, `decoder/...`, `reward/...` and `continue/...`.
+      batch: raw observations, "reward" [B, T] and "is_terminal" [B, T] bool.
+      states: "deter" [B, T, D], "stoch" [B, T, S, C] and "logits" [B, T, S, C], as `rssm.observe` returns them.
+
+    Returns:
+      "reconstruction/{key}" for every observation key, "reward", "continue", "dynamics" and "representation", each [B, T].
+
+    Raises:
+      ValueError: a key is missing, or a shape, dtype or Discrete value does not fit.
+    """
+    deter = checked("states deter", states["deter"], "B", "T", config.deter)
+    rows = deter.shape[:-1]
+    stoch = checked("states stoch", states["stoch"], *rows, config.stoch, config.classes)
+    require_shape("states logits", np.shape(states["logits"]), *rows, config.stoch, config.classes)
+    for key in ("reward", "is_terminal"):
+        if key not in batch:
+            raise ValueError(f"batch: the key {key!r} is missing; got {sorted(batch)}")
+        require_shape(f"batch {key}", np.shape(batch[key]), *rows)
+    for key, space in spaces.observations.items():
+        if key in batch:
+            require_shape(f"batch {key}", np.shape(batch[key]), *rows, *space.array_shape)
+
+    feature = networks.feature(deter, stoch)
+    predictions = networks.decoder(params, feature, spaces, config)
+    reconstruction = reconstruction_losses(predictions, batch, spaces, config)
+    reward_logits = networks.reward_head(params, feature, config)
+    continue_logit = networks.continue_head(params, feature, config)
+    dynamics, representation = kl_losses(states["logits"], rssm.prior(params, deter, config), config)
+    return {
+        **{f"reconstruction/{key}": loss for key, loss in reconstruction.items()},
+        "reward": symexp_twohot_loss(reward_logits, batch["reward"], exponential_bins(config.bins)),
+        "continue": bernoulli_loss(continue_logit, continue_target(batch["is_terminal"], config)),
+        "dynamics": dynamics,
+        "representation": representation,
+    }
+
+
+def _cross_entropy(logits: Array, target: Array, space: Discrete) -> Array:
+    """Cross entropy of one categorical for each entry of a Discrete, summed over the entries: [..., sum of classes] -> [...]."""
+    total, first = np.zeros(logits.shape[:-1]), 0
+    for classes in space.classes:
+        entry = slice(first, first + classes)
+        total = total - categorical_log_prob(unimix_log_probs(logits[..., entry], 0.0), target[..., entry])
+        first += classes
+    return total

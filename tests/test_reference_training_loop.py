@@ -1,0 +1,155 @@
+import json
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+from reference_numpy.training_loop import ReplayRatio, can_train, derive_seed, environment_action, make_record, step_flags
+from spec.config import load_config
+from spec.spaces import Discrete, Spaces, Vector
+
+
+def test_first_call_gives_one_step_and_no_credit():
+    ratio = ReplayRatio(32.0, 1024)
+    assert ratio(2048) == 1
+    assert [ratio(2048 + k) for k in range(1, 65)] == [0] * 31 + [1] + [0] * 31 + [1]
+
+
+def test_totals_of_the_chapter():
+    ratio = ReplayRatio(128.0, 1024)
+    assert sum(ratio(step) for step in range(1088, 100_001)) == 12_365
+
+
+def test_ratio_without_drift():
+    ratio = ReplayRatio(1.5, 4)
+    assert [ratio(step) for step in range(10, 19)] == [1, 0, 0, 1, 0, 0, 1, 0, 1]
+    ratio, total = ReplayRatio(0.1, 3), 0
+    for step in range(0, 300_001):
+        total += ratio(step)
+    assert total == 1 + int(300_000 * Fraction(0.1) / 3)
+    assert total == 10_001
+
+
+def test_ratio_may_jump_and_stand_still():
+    ratio = ReplayRatio(1024.0, 1024)
+    assert [ratio(5), ratio(5), ratio(6), ratio(16), ratio(16)] == [1, 0, 1, 10, 0]
+    with pytest.raises(ValueError, match="back"):
+        ratio(15)
+
+
+def test_ratio_zero_never_trains():
+    ratio = ReplayRatio(0.0, 1024)
+    assert [ratio(step) for step in range(5)] == [0] * 5
+
+
+def test_ratio_is_saved_exactly():
+    ratio, copy = ReplayRatio(0.3, 7), ReplayRatio(0.3, 7)
+    ratio(100)
+    ratio(133)
+    state = json.loads(json.dumps(ratio.state_dict()))
+    copy.load_state_dict(state)
+    assert [copy(step) for step in range(134, 300)] == [ratio(step) for step in range(134, 300)]
+    fresh = ReplayRatio(0.3, 7)
+    fresh.load_state_dict(json.loads(json.dumps(ReplayRatio(0.3, 7).state_dict())))
+    assert fresh(9) == 1
+
+
+def test_bad_ratio():
+    for ratio, batch in ((-1.0, 1), (float("inf"), 1), (1.0, 0)):
+        with pytest.raises(ValueError, match="replay_ratio"):
+            ReplayRatio(ratio, batch)
+
+
+def test_can_train():
+    config = load_config(batch_size=16, batch_length=64)
+    assert not can_train(1023, config)
+    assert can_train(1024, config)
+    with pytest.raises(ValueError, match="replay_capacity"):
+        can_train(0, load_config(replay_capacity=1023))
+
+
+def test_when_training_starts():
+    """One worker: step 1088; sixteen workers: step 2048 (spec/12-training-loop.md, worked numbers)."""
+    config = load_config()
+    for workers, expected in ((1, 1088), (16, 2048)):
+        records = next(n for n in range(10_000) if can_train(workers * max(0, n - config.batch_length), config))
+        assert records * workers == expected
+
+
+SPACES = Spaces({"x": Vector(1)}, {"turn": Vector(4), "buttons": Discrete((2, 3))})
+
+
+def test_environment_action():
+    low, high = {"turn": [0.0, -np.inf, 0.0, -2.0]}, {"turn": [10.0, np.inf, np.inf, 2.0]}
+    flat = [0.0, 1.0, 0.0, 0.0, 1.0, 0.5, -1.7, -0.25, 1.7]  # keys in sorted order: buttons, turn
+    result = environment_action(flat, SPACES, low, high)
+    assert result["buttons"].tolist() == [1, 2]
+    assert result["turn"].tolist() == [7.5, -1.0, 0.0, 2.0]
+    batch = environment_action(np.stack([flat, flat]), SPACES, low, high)
+    assert batch["buttons"].shape == (2, 2)
+    assert batch["turn"].shape == (2, 4)
+
+
+def test_environment_action_is_within_bounds_and_identity_without():
+    spaces = Spaces({"x": Vector(1)}, {"a": Vector(1)})
+    assert environment_action([1.0], spaces, {"a": [0.1]}, {"a": [0.3]})["a"][0] == 0.3
+    assert environment_action([1e-20], spaces, {"a": [-np.inf]}, {"a": [np.inf]})["a"][0] == 1e-20
+    assert environment_action([0.0, 0.0], Spaces({"x": Vector(1)}, {"a": Discrete((2,))}), {}, {})["a"].tolist() == [0]
+
+
+def test_environment_action_refuses():
+    with pytest.raises(ValueError, match="action"):
+        environment_action([0.0], SPACES, {}, {})
+    with pytest.raises(ValueError, match="finite"):
+        environment_action([np.nan], Spaces({"x": Vector(1)}, {"a": Vector(1)}), {"a": [0]}, {"a": [1]})
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ((True, False, False), (True, False, False)),
+        ((False, False, False), (False, False, False)),
+        ((False, True, False), (False, True, True)),
+        ((False, False, True), (False, True, False)),
+        ((False, True, True), (False, True, True)),
+    ],
+)
+def test_step_flags(given, expected):
+    assert tuple(step_flags(*given).values()) == expected
+    assert list(step_flags(*given)) == ["is_first", "is_last", "is_terminal"]
+
+
+def test_make_record():
+    stoch = np.eye(3)[[2, 0]]
+    middle = make_record({"x": np.float32([4])}, 2.5, step_flags(False, False, False), [1.7, -3.0], [0.5], stoch)
+    assert {key: value.tolist() for key, value in middle.items()} == {
+        "x": [4.0],
+        "is_first": False,
+        "is_last": False,
+        "is_terminal": False,
+        "reward": 2.5,
+        "action": [np.float32(1.7), -3.0],
+        "deter": [0.5],
+        "stoch": [2, 0],
+    }
+    last = make_record({"x": np.float32([4])}, 2.5, step_flags(False, False, True), [1.7, -3.0], [0.5], stoch)
+    assert last["action"].tolist() == [0.0, 0.0]
+    assert last["reward"] == 2.5
+    first = make_record({"x": np.float32([4])}, 2.5, step_flags(True, False, False), [1.7, -3.0], [0.5], stoch)
+    assert first["reward"] == 0.0
+    assert first["action"][1] == -3.0
+
+
+def test_make_record_copies():
+    x, action = np.float32([4]), np.float32([1.0])
+    made = make_record({"x": x}, 0.0, step_flags(False, False, False), action, [0.5], np.eye(3)[[2]])
+    x[...], action[...] = 9, 9
+    assert made["x"] == 4
+    assert made["action"] == 1
+
+
+def test_seeds_of_the_chapter():
+    assert derive_seed(0, "parameters") == 589476934
+    assert derive_seed(0, "environment", 1) == 783237557
+    assert derive_seed(7, "train", 1000) == 1045752270
+    assert len({derive_seed(seed, purpose, i) for seed in range(5) for purpose in ("a", "b") for i in range(50)}) == 500
