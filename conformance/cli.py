@@ -11,6 +11,7 @@ from conformance.adapter import COLUMNS, load_adapter
 from conformance.check import DTYPES
 from conformance.coverage import coverage
 from conformance.execute import Result, rows, run_check, selected_checks
+from conformance.mutants import MUTANTS, MutantAdapter
 from conformance.requirements import requirements
 from spec import profiles
 
@@ -30,9 +31,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     run.add_argument("--seed", type=int, default=0, help="seed of the drawn cases")
     run.add_argument("--examples", type=int, default=25, help="cases that hypothesis draws for each property")
     commands.add_parser("coverage", help="list every requirement and the checks that cover it; fails if one has none")
+    commands.add_parser("mutants", help="plant realistic mistakes in the reference one by one, and list the checks that catch each")
     options = parser.parse_args(arguments)
     console = Console(width=None if sys.stdout.isatty() else 150)
-    return _coverage(console) if options.command == "coverage" else _run(console, options)
+    return {"run": _run, "coverage": _coverage, "mutants": _mutants}[options.command](console, options)
 
 
 def _run(console: Console, options: argparse.Namespace) -> int:
@@ -78,7 +80,8 @@ def _print_run(console: Console, results: list[Result], options: argparse.Namesp
     console.print(f"{len(results)} checks, {numbers:,} numbers compared: " + ", ".join(f"{count} {name}" for name, count in counts.items()))
 
 
-def _coverage(console: Console) -> int:
+def _coverage(console: Console, options: argparse.Namespace) -> int:
+    del options
     table, problems = coverage()
     view = Table()
     for column in ("requirement", *COLUMNS, "text"):
@@ -91,6 +94,25 @@ def _coverage(console: Console) -> int:
         console.print(f"[bold red]{problem}")
     console.print(f"{len(table)} requirements, {len(problems)} problems")
     return 1 if problems or not table else 0
+
+
+def _mutants(console: Console, options: argparse.Namespace) -> int:
+    del options
+    checks = selected_checks("float64")
+    view = Table()
+    for column in ("mutant", "mistake", "caught by", "first"):
+        view.add_column(column, overflow="fold")
+    survivors = 0
+    with console.status("planting") as status:
+        for number, mutant in enumerate(MUTANTS.values(), 1):
+            status.update(f"{number}/{len(MUTANTS)} {mutant.name}")
+            results = (run_check(check, MutantAdapter(mutant), "float64", "paper", examples=5) for check in checks)
+            killers = [result.check.name for result in results if result.status in ("fail", "error")]
+            survivors += not killers
+            view.add_row(mutant.name, mutant.explanation, str(len(killers)), killers[0] if killers else "[bold red]nothing")
+    console.print(view)
+    console.print(f"{len(MUTANTS)} mutants, {survivors} survived")
+    return 1 if survivors else 0
 
 
 if __name__ == "__main__":

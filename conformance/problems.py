@@ -33,6 +33,7 @@ SMALL = {
     "batch_size": 2,
     "batch_length": 5,
     "imagination_horizon": 3,
+    "free_nats": 2.0,
     "warmup_steps": 10,
 }
 
@@ -67,7 +68,8 @@ def small_config(profile: str, dtype: str = "float64", **overrides: Any) -> Conf
 def random_parameters(rng: np.random.Generator, config: Config, task: Spaces, dtype: str = "float64") -> dict[str, np.ndarray]:
     """Every entry of the table, none of them zero or one.
 
-    The latents' logits are spread out, so that some KL divergences lie above the free nats and some below.
+    The latents' logits are spread out, so that some KL divergences lie above the free nats and some below. Rewards and values lean
+    towards the bins around zero, so that returns are of the size of real ones and not of the outermost bins.
     """
     params = {}
     for name, entry in parameter_table(config, task).items():
@@ -76,6 +78,8 @@ def random_parameters(rng: np.random.Generator, config: Config, task: Spaces, dt
             value = rng.normal(0.0, spread / math.sqrt(entry.fan_in), entry.shape)
         else:
             value = rng.normal(float(entry.initializer == "ones"), 0.2, entry.shape)
+        if name in ("reward/out/bias", "critic/out/bias"):
+            value -= 1.5 * np.abs(np.arange(config.bins) - config.bins // 2)
         params[name] = round_to(value, "float32" if dtype == "bfloat16" else dtype)
     return params
 
@@ -178,3 +182,11 @@ def make_problem(seed: int, profile: str, observation: str, action: str, dtype: 
     rng = np.random.default_rng(seed)
     config, task = small_config(profile, dtype, **overrides), spaces(observation, action)
     return Problem(task, config, random_state(rng, config, task, dtype), random_batch(rng, config, task), train_noise(rng, config, task))
+
+
+def nudged(problem: Problem, distance: float) -> Problem:
+    """The problem with all its uniform numbers moved by a distance; normal numbers stay."""
+    is_uniform = [isinstance(space, Discrete) for space in problem.spaces.actions.values() for _ in range(space.array_shape[0])]
+    shift = {"posterior": distance, "prior": distance, "action": distance * np.array(is_uniform)}
+    noise = {name: value + shift[name] for name, value in problem.noise.items()}
+    return dataclasses.replace(problem, noise=noise)
