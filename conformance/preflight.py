@@ -18,8 +18,8 @@ from reference_numpy import agent, networks, rssm
 from spec import Config, Spaces
 
 ROWS = 2
-STEPS = 3
-SAMPLING_MARGIN = 1e-4
+STEPS = 2
+SAMPLING_MARGIN = 1e-5
 NETWORK_BOUND = {"float64": 1e-9, "float32": 1e-3, "bfloat16": 0.1}
 LOSS_BOUND = {"float64": 1e-8, "float32": 2e-3}
 GRADIENT_BOUND = {"float64": 1e-5, "float32": 2e-2}

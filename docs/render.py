@@ -16,7 +16,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from spec import hyperparameters, profiles, sizes
+from spec import benchmarks, hyperparameters, profiles, sizes
 
 ROOT = Path(__file__).resolve().parent.parent
 PART = re.compile(r"(<!-- (quote|table): ([^>]*?) -->\n).*?(<!-- end \2 -->)", re.DOTALL)
@@ -62,10 +62,12 @@ def _sizes() -> list[tuple[str, dict[str, int]]]:
 
 
 def _value(value: object) -> str:
-    return str(value).lower() if isinstance(value, bool) else str(value)
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f"{value:,}" if isinstance(value, int) else str(value)
 
 
-TABLES: dict[str, Callable[[], str]] = {"hyperparameters": hyperparameter_table, "sizes": size_table}
+TABLES: dict[str, Callable[[], str]] = {"hyperparameters": hyperparameter_table, "sizes": size_table, "benchmarks": benchmark_table}
 
 
 def render(text: str) -> str:

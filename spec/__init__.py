@@ -1,6 +1,6 @@
 """What every column of the grid agrees on: the chapters, the numbers, the configuration, the spaces and the parameter table."""
 
-from spec.config import Config, hyperparameters, load_config, profiles, sizes
+from spec.config import Config, benchmarks, hyperparameters, load_config, profiles, sizes
 from spec.parameters import Parameter, parameter_table
 from spec.spaces import Discrete, Image, Spaces, Vector
 
@@ -11,6 +11,7 @@ __all__ = [
     "Parameter",
     "Spaces",
     "Vector",
+    "benchmarks",
     "hyperparameters",
     "load_config",
     "parameter_table",

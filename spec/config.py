@@ -1,4 +1,4 @@
-"""The typed configuration, filled from hyperparameters.toml, profiles.toml and sizes.toml beside this file.
+"""The typed configuration, filled from hyperparameters.toml, profiles.toml and sizes.toml beside this file; benchmark protocols from benchmarks.toml.
 
 A configuration is made in this order, later values winning: the value of the profile `paper`, the values of the chosen profile, the
 values of the chosen model size, explicit overrides.
@@ -111,9 +111,7 @@ class Config:
             _check_value(name, getattr(self, name), entry)
         _require(self.deter % self.blocks == 0, "deter", self.deter, f"a multiple of blocks = {self.blocks}")
         stem = self.cnn_multipliers[-1] * self.cnn_depth
-        _require(
-            stem % self.blocks == 0, "cnn_depth", self.cnn_depth, f"last multiplier x cnn_depth a multiple of blocks = {self.blocks}"
-        )
+        _require(stem % self.blocks == 0, "cnn_depth", self.cnn_depth, f"last multiplier x cnn_depth a multiple of blocks = {self.blocks}")
         _require(self.bins % 2 == 1 and self.bins >= 3, "bins", self.bins, "an odd number of at least 3")
         _require(self.discount_horizon > 1, "discount_horizon", self.discount_horizon, "more than 1")
         _require(self.actor_min_std > 0, "actor_min_std", self.actor_min_std, "more than 0")
@@ -203,3 +201,9 @@ def profiles() -> dict[str, dict[str, Any]]:
 def sizes() -> dict[str, dict[str, Any]]:
     """Size name -> the hyperparameters that it sets."""
     return _read("sizes.toml")
+
+
+@functools.cache
+def benchmarks() -> dict[str, dict[str, Any]]:
+    """Suite -> its protocol as the paper has it; the entry `official` holds what that profile changes."""
+    return _read("benchmarks.toml")
