@@ -15,6 +15,7 @@ import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from spec import benchmarks, hyperparameters, profiles, sizes
 
@@ -51,14 +52,23 @@ def hyperparameter_table() -> str:
 
 
 def size_table() -> str:
+    """Every size; what a size does not set has the default."""
     names = list(next(iter(sizes().values())))
-    return markdown_table(
-        ["size", *(f"`{name}`" for name in names)], [[size, *(str(v.get(n, "32")) for n in names)] for size, v in _sizes()]
-    )
+    rows = [[f"`{size}`", *(str(values.get(name, hyperparameters()[name]["value"])) for name in names)] for size, values in sizes().items()]
+    return markdown_table(["size", *(f"`{name}`" for name in names)], rows)
 
 
-def _sizes() -> list[tuple[str, dict[str, int]]]:
-    return list(sizes().items())
+def benchmark_table() -> str:
+    """Every suite; values of the profile `official` in parentheses where they differ."""
+    names = ["tasks", "steps", "action_repeat", "envs", "replay_ratio", "size", "observation"]
+
+    def cell(suite: dict[str, Any], name: str) -> str:
+        official = suite.get("official", {})
+        changed = f" ({_value(official[name])})" if name in official else ""
+        return (_value(suite[name]) if name in suite else "environment's") + changed
+
+    rows = [[f"`{name}`", *(cell(suite, column) for column in names)] for name, suite in benchmarks().items()]
+    return markdown_table(["suite", *names], rows)
 
 
 def _value(value: object) -> str:

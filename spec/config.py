@@ -1,4 +1,4 @@
-"""The typed configuration, filled from hyperparameters.toml, profiles.toml and sizes.toml beside this file; benchmark protocols from benchmarks.toml.
+"""The typed configuration, filled from hyperparameters.toml, profiles.toml and sizes.toml beside this file, and the benchmark protocols.
 
 A configuration is made in this order, later values winning: the value of the profile `paper`, the values of the chosen profile, the
 values of the chosen model size, explicit overrides.
