@@ -1,6 +1,7 @@
 """The command `conformance`."""
 
 import argparse
+import importlib
 import sys
 from collections.abc import Sequence
 
@@ -23,7 +24,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="conformance", description="Checks an implementation of DreamerV3 against the specification.")
     commands = parser.add_subparsers(dest="command", required=True)
     run = commands.add_parser("run", help="run the checks on a backend", formatter_class=argparse.ArgumentDefaultsHelpFormatter)
-    run.add_argument("--backend", choices=COLUMNS, required=True, help="which column of the grid to check")
+    candidate = run.add_mutually_exclusive_group(required=True)
+    candidate.add_argument("--backend", choices=COLUMNS, help="which of our own columns to check")
+    candidate.add_argument(
+        "--adapter", metavar="MODULE", help="importable module of your own that offers functions of conformance/adapter.py"
+    )
     run.add_argument("--dtype", choices=DTYPES, default="float64", help="precision of the backend")
     run.add_argument("--device", default=None, help="device of the backend, as the backend names it: cpu, cuda, gpu, ...")
     run.add_argument("--profile", choices=tuple(profiles()), default="paper", help="profile of the configurations")
@@ -39,9 +44,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(console: Console, options: argparse.Namespace) -> int:
     try:
-        adapter = load_adapter(options.backend, options.dtype, options.device)
+        adapter = _load(options)
     except ImportError as error:
-        print(f"conformance: error: {error}; install it with: pip install 'dreamer-spec[{options.backend}]'", file=sys.stderr)
+        hint = f"install it with: pip install 'dreamer-spec[{options.backend}]'" if options.backend else "is it on PYTHONPATH?"
+        print(f"conformance: error: {error}; {hint}", file=sys.stderr)
         return 2
     checks = selected_checks(options.dtype, options.only)
     if not checks:
@@ -56,8 +62,17 @@ def _run(console: Console, options: argparse.Namespace) -> int:
     return 0 if all(result.status in ("pass", "not offered") for result in results) and any(r.status == "pass" for r in results) else 1
 
 
+def _load(options: argparse.Namespace) -> object:
+    if options.backend:
+        return load_adapter(options.backend, options.dtype, options.device)
+    sys.path.insert(0, "")
+    return importlib.import_module(options.adapter)
+
+
 def _print_run(console: Console, results: list[Result], options: argparse.Namespace) -> None:
-    table = Table(title=f"{options.backend}, {options.dtype}, profile {options.profile}, seed {options.seed}", title_justify="left")
+    table = Table(
+        title=f"{options.backend or options.adapter}, {options.dtype}, profile {options.profile}, seed {options.seed}", title_justify="left"
+    )
     for column in ("requirement", "checks", "worst deviation", "of allowed", "where", "result"):
         table.add_column(column, overflow="fold")
     for row in rows(results):

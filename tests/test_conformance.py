@@ -1,0 +1,35 @@
+"""The backends conform: every check, in both profiles and every precision."""
+
+import pytest
+
+from conformance.adapter import load_adapter
+from conformance.check import DTYPES, Check
+from conformance.execute import run_check, selected_checks
+
+CASES = [
+    pytest.param(backend, dtype, profile, check, id=f"{backend}-{dtype}-{profile}-{check.name}", marks=pytest.mark.xdist_group(backend))
+    for backend in ("jax", "torch")
+    for dtype in DTYPES
+    for profile in ("paper", "official")
+    for check in selected_checks(dtype)
+]
+
+
+@pytest.mark.parametrize(("backend", "dtype", "profile", "check"), CASES)
+def test_the_backend_passes(backend: str, dtype: str, profile: str, check: Check) -> None:
+    result = run_check(check, load_adapter(backend, dtype), dtype, profile, examples=10)
+    assert result.status in ("pass", "not offered"), result.message
+
+
+@pytest.mark.parametrize("backend", ["jax", "torch"])
+def test_the_backend_offers_what_its_checks_use(backend: str) -> None:
+    adapter = load_adapter(backend)
+    shared = {"Replay", "ReplayRatio", "train_step_with"}
+    missing = {name for check in selected_checks("float64") for name in check.uses if not hasattr(adapter, name)}
+    assert {name for name in missing if name not in shared and not _belongs_to_the_trainer(name)} == set()
+
+
+def _belongs_to_the_trainer(name: str) -> bool:
+    from reference_numpy import replay, training_loop
+
+    return name in vars(replay) or name in vars(training_loop)

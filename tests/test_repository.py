@@ -1,0 +1,120 @@
+"""What holds for the repository as text: the grid, the one-way dependencies, citations, generated parts."""
+
+import ast
+import importlib
+import inspect
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from conformance.coverage import coverage
+from conformance.requirements import requirements
+from docs.render import stale
+
+ROOT = Path(__file__).resolve().parent.parent
+ROWS = [
+    *("transforms", "distributions", "layers", "rssm", "networks", "world_model"),
+    *("returns", "behavior", "optimizer", "agent"),
+]
+SHARED_ROWS = ["replay", "training_loop"]
+MAY_IMPORT = {
+    "spec": set(),
+    "reference_numpy": {"spec"},
+    "impl_jax": {"spec"},
+    "impl_torch": {"spec"},
+    "conformance": {"spec", "reference_numpy"},
+    "train": {"spec", "reference_numpy", "conformance"},
+}
+ADAPTERS = {"jax_adapter.py": "impl_jax", "torch_adapter.py": "impl_torch"}
+
+
+def public_functions(row: str) -> list[tuple[str, object]]:
+    module = importlib.import_module(f"reference_numpy.{row}")
+    members = inspect.getmembers(module, lambda member: inspect.isfunction(member) or inspect.isclass(member))
+    return [(name, member) for name, member in members if member.__module__ == module.__name__ and not name.startswith("_")]
+
+
+@pytest.mark.parametrize("row", [*ROWS, *SHARED_ROWS, "stop_gradient"])
+def test_every_public_function_of_the_reference_cites_its_requirements(row: str) -> None:
+    functions = public_functions(row)
+    assert functions
+    for name, function in functions:
+        cited = set(re.findall(r"\[([A-Z]{2,6}-\d+)\]", inspect.getdoc(function) or ""))
+        assert cited, f"{row}.{name} cites no requirement"
+        assert cited <= set(requirements()), f"{row}.{name} cites {sorted(cited - set(requirements()))}, which no chapter has"
+
+
+def test_every_cited_requirement_exists() -> None:
+    for path in [*ROOT.glob("spec/*.md"), *ROOT.glob("*/*.py"), *ROOT.glob("conformance/*/*.py")]:
+        cited = set(re.findall(r"\[((?:CON|TRA|DIS|LAY|RSSM|NET|WM|RET|BEH|OPT|AGT|REP|LOOP)-\d+)\]", path.read_text(encoding="utf-8")))
+        assert cited <= set(requirements()), f"{path.name} cites {sorted(cited - set(requirements()))}"
+
+
+def test_every_requirement_is_covered() -> None:
+    table, problems = coverage()
+    assert len(table) > 200
+    assert problems == []
+
+
+def test_every_decision_is_there() -> None:
+    text = (ROOT / "spec" / "decisions.md").read_text(encoding="utf-8")
+    numbers = [int(number) for number in re.findall(r"^### D-(\d+)", text, re.MULTILINE)]
+    assert numbers == list(range(1, 139))
+
+
+def test_cited_decisions_exist() -> None:
+    known = set(re.findall(r"^### ([DE]-\d+)", (ROOT / "spec" / "decisions.md").read_text(encoding="utf-8"), re.MULTILINE))
+    for path in [*ROOT.glob("spec/*.md"), *ROOT.glob("spec/*.toml"), *ROOT.glob("*/*.py")]:
+        cited = set(re.findall(r"\b([DE]-\d{2,3})\b", path.read_text(encoding="utf-8")))
+        assert cited <= known, f"{path.name} cites {sorted(cited - known)}"
+
+
+@pytest.mark.parametrize("row", ROWS)
+def test_the_grid_shows_in_the_folders(row: str) -> None:
+    assert [path.name for path in (ROOT / "spec").glob(f"*-{row.replace('_', '-')}.md")]
+    for column in ("reference_numpy", "impl_jax", "impl_torch", "conformance/cases"):
+        assert (ROOT / column / f"{row}.py").exists(), f"{column} lacks the row {row}"
+
+
+def imported_packages(path: Path) -> set[str]:
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+        names += [node.module] if isinstance(node, ast.ImportFrom) and node.module else []
+        found |= {name.split(".")[0] for name in names}
+    return found
+
+
+@pytest.mark.parametrize("package", MAY_IMPORT)
+def test_dependencies_point_one_way(package: str) -> None:
+    for path in (ROOT / package).rglob("*.py"):
+        allowed = MAY_IMPORT[package] | {package} | {ADAPTERS.get(path.name, package)}
+        ours = imported_packages(path) & set(MAY_IMPORT)
+        assert ours <= allowed, f"{path.relative_to(ROOT)} imports {sorted(ours - allowed)}"
+
+
+def test_nothing_is_unpickled() -> None:
+    forbidden = re.compile(r"import pickle|pickle\.loads?|allow_pickle\s*=\s*True|weights_only\s*=\s*False|torch\.load\(")
+    for path in ROOT.glob("*/**/*.py"):
+        if ".venv" not in path.parts and path.name != Path(__file__).name:
+            assert not forbidden.search(path.read_text(encoding="utf-8")), path
+
+
+def test_generated_parts_of_the_documents_are_current() -> None:
+    assert stale() == [], "run: make docs"
+
+
+def test_links_between_documents_lead_somewhere() -> None:
+    for path in [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *ROOT.glob("spec/*.md"), *ROOT.glob("docs/*.md")]:
+        for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", path.read_text(encoding="utf-8")):
+            if "://" not in target:
+                assert (path.parent / target).exists(), f"{path.relative_to(ROOT)} links to {target}, which is missing"
+
+
+def test_every_package_is_in_the_distribution() -> None:
+    configuration = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    listed = set(configuration["tool"]["setuptools"]["packages"])
+    present = {str(path.parent.relative_to(ROOT)).replace("/", ".") for name in MAY_IMPORT for path in (ROOT / name).rglob("__init__.py")}
+    assert listed == present
