@@ -157,12 +157,16 @@ class Adapter(Protocol):
     ) -> tuple[Nested, Nested]:
         """The same with given gradients, for implementations without automatic differentiation."""
 
-    # replay and training loop: classes with the methods of the reference
-    Replay: Any
-    ReplayRatio: Any
-
+    # replay and training loop: shared by all backends. The classes have the constructors and methods of the reference's.
+    def Replay(self, capacity: int, length: int) -> Any: ...  # noqa: N802
+    def ReplayRatio(self, replay_ratio: float, batch_steps: int) -> Any: ...  # noqa: N802
     def can_train(self, items: int, config: Config) -> bool: ...
+    def step_flags(self, reset: bool, terminated: bool, truncated: bool) -> Mapping[str, bool]: ...
+    def make_record(
+        self, observation: Arrays, reward: float, flags: Mapping[str, bool], action: Array, deter: Array, stoch: Array
+    ) -> Arrays: ...
     def environment_action(self, action: Array, spaces: Spaces, low: Arrays, high: Arrays) -> Arrays: ...
+    def derive_seed(self, seed: int, purpose: str, index: int) -> int: ...
 
 
 COLUMNS = ("numpy", "jax", "torch")

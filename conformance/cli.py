@@ -35,7 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     run.add_argument("--only", default="", help="only checks whose name or requirement id contains this")
     run.add_argument("--seed", type=int, default=0, help="seed of the drawn cases")
     run.add_argument("--examples", type=int, default=25, help="cases that hypothesis draws for each property")
-    commands.add_parser("coverage", help="list every requirement and the checks that cover it; fails if one has none")
+    commands.add_parser("coverage", help="list every requirement and what covers it; fails if one is not covered")
     commands.add_parser("mutants", help="plant realistic mistakes in the reference one by one, and list the checks that catch each")
     options = parser.parse_args(arguments)
     console = Console(width=None if sys.stdout.isatty() else 150)
@@ -99,10 +99,11 @@ def _coverage(console: Console, options: argparse.Namespace) -> int:
     del options
     table, problems = coverage()
     view = Table()
-    for column in ("requirement", *COLUMNS, "text"):
+    columns = (*COLUMNS, "tests")
+    for column in ("requirement", *columns, "text"):
         view.add_column(column, no_wrap=column == "text", overflow="ellipsis" if column == "text" else "fold")
-    for requirement, columns in table.items():
-        counts = (str(len(columns[column])) if column in columns else "-" for column in COLUMNS)
+    for requirement, covering in table.items():
+        counts = (str(len(covering[column])) if column in covering else "-" for column in columns)
         view.add_row(requirement, *counts, requirements()[requirement].replace("[", r"\["))
     console.print(view)
     for problem in problems:

@@ -1,27 +1,64 @@
-"""Which checks cover which requirement on which column."""
+"""Which checks and tests cover which requirement on which column."""
+
+import ast
+from pathlib import Path
 
 from conformance.adapter import COLUMNS, load_adapter
 from conformance.check import CHECKS
 from conformance.execute import offered, selected_checks
 from conformance.requirements import requirements
 
-# Replay and the training loop are rows that both backends share: the reference and the trainer are their columns.
+# Replay and the training loop are rows that both backends share: the reference's classes are the ones that the trainer uses.
 SHARED_ROWS = ("REP", "LOOP")
+TESTS = Path(__file__).resolve().parent.parent / "tests"
 
 
 def coverage() -> tuple[dict[str, dict[str, list[str]]], list[str]]:
-    """Requirement -> column -> names of the checks that cover it there, and what is wrong: uncovered requirements and unknown ids."""
+    """Requirement -> column -> names of the checks that cover it there, and what is wrong: uncovered requirements and unknown ids.
+
+    The column `tests` holds tests marked with `pytest.mark.covers`: what a whole trainer or learner shows, and no adapter can. Such a
+    requirement needs no check.
+    """
     selected_checks("float64")
     adapters = {column: load_adapter(column) for column in COLUMNS}
+    tests = covering_tests()
     table: dict[str, dict[str, list[str]]] = {}
     problems = []
     for requirement in requirements():
         columns = ("numpy",) if requirement.split("-")[0] in SHARED_ROWS else COLUMNS
-        table[requirement] = {
+        checks = {
             column: [check.name for check in CHECKS.values() if requirement in check.requirements and offered(adapters[column], check)]
             for column in columns
         }
-        problems += [f"{requirement}: no check covers it on {column}" for column, checks in table[requirement].items() if not checks]
+        table[requirement] = {**checks, "tests": tests.get(requirement, [])}
+        if requirement not in tests:
+            problems += [f"{requirement}: no check covers it on {column}, and no test" for column, names in checks.items() if not names]
     for check in CHECKS.values():
         problems += [f"{check.name} names {name}, which no chapter has" for name in check.requirements if name not in requirements()]
+    problems += [f"{', '.join(tests[name])} names {name}, which no chapter has" for name in tests if name not in requirements()]
     return table, problems
+
+
+def covering_tests(folder: Path = TESTS) -> dict[str, list[str]]:
+    """Requirement -> tests marked `@pytest.mark.covers("LOOP-1", ...)`, read from their source: the tests are not run, nor imported.
+
+    Empty where there is no such folder: an installed package comes without tests.
+
+    Raises:
+      ValueError: a mark whose arguments are not written out.
+    """
+    found: dict[str, list[str]] = {}
+    for path in sorted(folder.glob("test_*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.FunctionDef) and node.name.startswith("test_"):
+                for identifier in _marked(node, path):
+                    found.setdefault(identifier, []).append(f"{path.stem}.{node.name}")
+    return found
+
+
+def _marked(function: ast.FunctionDef, path: Path) -> list[str]:
+    marks = [mark for mark in function.decorator_list if isinstance(mark, ast.Call) and ast.unparse(mark.func) == "pytest.mark.covers"]
+    identifiers = [argument.value if isinstance(argument, ast.Constant) else None for mark in marks for argument in mark.args]
+    if any(mark.keywords or not mark.args for mark in marks) or not all(isinstance(identifier, str) for identifier in identifiers):
+        raise ValueError(f"{path.name}:{function.lineno}: pytest.mark.covers takes requirement ids, written out")
+    return [str(identifier) for identifier in identifiers]

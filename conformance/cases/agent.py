@@ -75,7 +75,7 @@ def problem_of(run: Run, observation: str, action: str) -> Problem:
 LOSS_REQUIREMENTS = (
     *(f"AGT-{n}" for n in range(14, 28)),
     *("RET-3", "RET-4", "RET-5", "RET-6", "RET-11", "RET-15", "BEH-11", "BEH-16", "BEH-17", "BEH-18"),
-    *("WM-1", "WM-9", "WM-15", "WM-16"),
+    *("WM-1", "WM-9", "WM-15", "WM-16", "CON-1", "CON-2", "CON-3", "CON-4", "CON-13", "CON-20", "CON-23", "CON-24"),
 )
 
 

@@ -1,0 +1,114 @@
+"""Gradients of single functions, seen through the losses: where infinities, ties and norms make automatic differentiation go wrong."""
+
+import dataclasses
+import functools
+from typing import Any
+
+import numpy as np
+
+from conformance.cases.agent import SAMPLING_MARGIN, WHOLE, bound_of, nudged
+from conformance.check import Run, check
+from conformance.problems import Problem, make_problem
+from reference_numpy import agent
+from reference_numpy.transforms import exponential_bins, twohot
+from reference_numpy.world_model import continue_target
+
+MASKED = ("rssm/posterior/out/bias", "rssm/prior/out/bias", "actor/out/buttons/logits/bias")
+
+
+@functools.lru_cache(maxsize=8)
+def masked_problem(seed: int, profile: str, dtype: str) -> Problem:
+    """No mixtures; one class of the first latent and one of an action have probability 0. No sample lies near a boundary."""
+    for attempt in range(100):
+        problem = make_problem(1000 * seed + attempt, profile, "vector", "mixed", dtype, latent_unimix=0.0, actor_unimix=0.0, free_nats=0.0)
+        for name in MASKED:
+            problem.state["params"][name][1] = -np.inf
+        totals = {agent.losses(*nudged(problem, shift).loss_arguments)[0] for shift in (-SAMPLING_MARGIN, SAMPLING_MARGIN)}
+        if len(totals) == 1 and np.isfinite(totals.pop()):
+            return problem
+    raise RuntimeError("no problem with a sampling margin was found")
+
+
+@check(
+    "DIS-2", "DIS-4", "DIS-9", "DIS-12", "DIS-14", "DIS-21", "BEH-7", uses=["loss_derivatives"], level=2, dtypes=WHOLE
+)  # fmt: skip
+def impossible_classes_have_finite_gradients(run: Run) -> None:
+    """Every loss has its finite derivative where a latent and an action have classes of probability 0."""
+    problem = masked_problem(run.seed, run.profile, run.dtype)
+    params, rng = problem.state["params"], run.rng()
+    directions = [{name: rng.normal(size=value.shape) / 16 for name, value in params.items()} for _ in range(3)]
+    names = list(agent.losses(*problem.loss_arguments)[1]["losses"])
+
+    def means(point: Any) -> np.ndarray:
+        losses = agent.losses(point, *problem.loss_arguments[1:])[1]["losses"]
+        return np.array([losses[name] for name in names])
+
+    expected = np.array([agent.directional_derivative(means, params, direction, 1e-5) for direction in directions]).T
+    actual = run.call("loss_derivatives", *problem.loss_arguments, directions)
+    for name, derivatives in zip(names, expected, strict=True):
+        magnitude = np.abs(derivatives).max() + 1e-3
+        run.compare(f"derivative of {name}", actual[name], derivatives, magnitude=magnitude, bound=bound_of(run, 1e-6, 5e-3))
+
+
+@check("DIS-14", "DIS-17", uses=["loss_derivatives"], level=2, dtypes=WHOLE)
+def zero_outputs_have_the_gradients_of_the_chapter(run: Run) -> None:
+    """At a logit of 0 the derivative of the continue loss is 1/2 - target, that of the reward loss is 1/K minus the two-hot target."""
+    problem = make_problem(run.seed, run.profile, "vector", "discrete", run.dtype)
+    params, config = dict(problem.state["params"]), problem.config
+    for name in ("continue/out/kernel", "continue/out/bias", "reward/out/kernel", "reward/out/bias"):
+        params[name] = np.zeros_like(params[name])
+    along = run.rng().normal(size=config.bins)
+    directions = [{"continue/out/bias": np.ones(1)}, {"reward/out/bias": along}]
+    actual = run.call("loss_derivatives", params, *problem.loss_arguments[1:], directions)
+    target = continue_target(problem.batch["is_terminal"], config).mean()
+    weights = twohot(problem.batch["reward"], exponential_bins(config.bins)).mean((0, 1))
+    bound = bound_of(run, 1e-8, 1e-5)
+    run.compare("derivative of continue", actual["continue"], np.array([0.5 - target, 0]), magnitude=1.0, bound=bound)
+    run.compare("derivative of reward", actual["reward"], np.array([0, (1 / config.bins - weights) @ along]), magnitude=1.0, bound=bound)
+
+
+@functools.lru_cache(maxsize=8)
+def problem_without_epsilon(seed: int, profile: str, dtype: str) -> Problem:
+    """All observations and actions, and norms that are exact up to 1e-12."""
+    for attempt in range(100):
+        problem = make_problem(1000 * seed + attempt, profile, "both", "mixed", dtype, norm_epsilon=1e-12)
+        totals = {agent.losses(*nudged(problem, shift).loss_arguments)[0] for shift in (-SAMPLING_MARGIN, SAMPLING_MARGIN)}
+        if len(totals) == 1:
+            return problem
+    raise RuntimeError("no problem with a sampling margin was found")
+
+
+@check("LAY-4", "LAY-8", uses=["loss_derivatives"], level=2, dtypes=WHOLE)
+def normalized_layers_have_no_gradient_along_themselves(run: Run) -> None:
+    """A norm undoes longer kernels and biases, so no loss changes along them: the gradient passes through the mean square too."""
+    problem = problem_without_epsilon(run.seed, run.profile, run.dtype)
+    params = problem.state["params"]
+    layers = [name.removesuffix("/scale") for name in params if name.endswith("/scale") and "stem" not in name]
+    along = {f"{layer}/{part}": params[f"{layer}/{part}"] / 16 for layer in layers for part in ("kernel", "bias")}
+    across = {f"{layer}/scale": params[f"{layer}/scale"] / 16 for layer in layers}
+    actual = run.call("loss_derivatives", *problem.loss_arguments, [along, across])
+    for name, (zero, size) in actual.items():
+        run.compare(f"derivative of {name}", zero, 0.0, magnitude=abs(size) + 0.1, bound=bound_of(run, 1e-6, 1e-3))
+
+
+@check("LAY-12", uses=["gradients"], level=2, dtypes=WHOLE)
+def the_first_of_equal_pixels_has_the_gradient(run: Run) -> None:
+    """Where the four pixels of every window are equal, the gradient is the one that holds nearby, where the first is a little larger.
+
+    The image repeats a 2x2 pattern and the first layer sees only its middle tap, so its output is the same at every window, and the
+    gradient of that tap is the pixel that was chosen, times what comes from above.
+    """
+    problem = make_problem(
+        run.seed, run.profile, "image", "discrete", run.dtype, cnn_sampling="pooled", cnn_outer=False, cnn_multipliers=(1, 2, 4)
+    )
+    pattern = np.array([[240, 30], [100, 5]], np.uint8)
+    batch = {**problem.batch, "image": np.tile(pattern[..., None], (*problem.batch["reward"].shape, 8, 16, 3))}
+    kernel = "encoder/image/conv0/kernel"
+    middle = np.zeros_like(problem.state["params"][kernel])
+    middle[2, 2] = np.abs(problem.state["params"][kernel][2, 2])
+    gradients = []
+    for size in (0.0, 1e-5):
+        state = {**problem.state, "params": {**problem.state["params"], kernel: size * middle}}
+        changed = dataclasses.replace(problem, state=state, batch=batch)
+        gradients.append(np.asarray(run.call("gradients", *changed.loss_arguments)[kernel])[2, 2])
+    run.compare("gradient of the middle tap", gradients[0], gradients[1], magnitude="tensor", bound=1e-2)

@@ -1,0 +1,326 @@
+"""Checks of spec/06-world-model.md."""
+
+import dataclasses
+import functools
+import math
+from typing import Any
+
+import hypothesis.strategies as st
+import numpy as np
+
+from conformance.cases.agent import WHOLE, bound_of, nudged, problem_of, unit_directions
+from conformance.check import Run, check, round_to
+from conformance.problems import Problem, make_problem, random_observations, small_config
+from conformance.strategies import adversarial_numbers, arrays, normals, seeds
+from reference_numpy import agent, networks, rssm
+from reference_numpy import world_model as reference
+from reference_numpy.distributions import unimix_log_probs
+from reference_numpy.transforms import exponential_bins, twohot
+from spec import Discrete, Image, Spaces, Vector
+
+ACTIONS: dict[str, Vector | Discrete] = {"turn": Vector(2)}
+TASK = Spaces({"position": Vector(3), "mode": Discrete((2, 3)), "image": Image(4, 6, 3)}, ACTIONS)
+SURE = math.log(3.0)  # logits (0, ln 3) and a mixture of one percent: 0.128082 nats from the uniform distribution, 0.140535 nats to it
+WEIGHTS = {f"{name}_scale": weight for name, weight in (("reconstruction", 2.0), ("reward", 3.0), ("continue", 5.0), ("dynamics", 7.0))}
+
+
+def held(run: Run, x: Any) -> np.ndarray:
+    """Losses read numbers of float32 or better in every compute dtype."""
+    return round_to(x, "float64" if run.dtype == "float64" else "float32")
+
+
+@check("WM-7", "CON-11", uses=["continue_target"], level=0)
+def continue_target_literals(run: Run) -> None:
+    """0 at terminations; elsewhere 1, or 332/333 for the discounted target; any shape."""
+    is_terminal = np.array([[False, True, False], [True, False, False]])
+    hard, soft = (small_config(run.profile, run.dtype, continue_target=kind) for kind in ("hard", "discounted"))
+    run.exact("hard", run.call("continue_target", is_terminal, hard), np.array([[1.0, 0, 1], [0, 1, 1]]))
+    run.expect("continue_target", (is_terminal, soft), np.array([[1.0, 0, 1], [0, 1, 1]]) * (332 / 333), bound=4 * run.u)
+    other = dataclasses.replace(soft, discount_horizon=4.0)
+    run.exact("discount 3/4", run.call("continue_target", is_terminal[0], other), np.array([0.75, 0, 0.75]))
+
+
+@check("WM-10", "WM-11", "WM-14", "RSSM-10", uses=["kl_losses"], level=0)
+def kl_literals(run: Run) -> None:
+    """2, 7, 8 and 10 latents of 0.128082 nats give 1, 1, 1.024657 and 1.280821: sum, then clip, for each row by itself."""
+    config = small_config(run.profile, run.dtype, stoch=10, classes=2, latent_unimix=0.01, free_nats=1.0)
+    sure, zeros = np.zeros((5, 10, 2)), np.zeros((5, 10, 2))
+    for row, latents in enumerate((2, 7, 8, 10, 10)):
+        sure[row, :latents, 1] = SURE
+    sure = held(run, sure)
+    posterior, prior = np.concatenate([sure[:4], zeros[:1]]), np.concatenate([zeros[:4], sure[4:]])
+    expected = np.array([1, 1, 1.024657082, 1.280821352, 1.40535321])  # in the last row the prior is the sure one
+    bound = 1e-8 if run.dtype == "float64" else 64 * run.u
+    run.expect("kl_losses", (posterior, prior, config), (expected, expected), bound=bound)
+    lower = dataclasses.replace(config, free_nats=0.3)
+    expected = np.array([0.3, 0.896574946, 1.024657082, 1.280821352, 1.40535321])
+    run.expect("kl_losses", (posterior, prior, lower), (expected, expected), bound=bound)
+
+
+@check("WM-10", "RSSM-10", uses=["kl_losses"], level=0)
+def kl_is_bounded(run: Run) -> None:
+    """32 latents of 64 classes that are sure of different classes are 277.331813 nats apart: the mixture is in both distributions."""
+    config = small_config(run.profile, run.dtype, stoch=32, classes=64, latent_unimix=0.01)
+    first, last = np.full((1, 32, 64), -1e4), np.full((1, 32, 64), -1e4)
+    first[..., 0] = last[..., -1] = 1e4
+    expected = np.array([277.331813])
+    bound = 1e-8 if run.dtype == "float64" else 64 * run.u
+    run.expect("kl_losses", (first, last, config), (expected, expected), bound=bound)
+    plain = dataclasses.replace(config, latent_unimix=0.0)
+    logits = np.zeros((1, 32, 64))
+    logits[..., 0] = math.log(63)
+    half = 32 * (0.5 * math.log(0.5 * 64) + 0.5 * math.log(64 * 0.5 / 63))  # (1/2, 1/126, ...) from (1/64, ...), without mixture
+    expected = np.array([half])
+    run.expect("kl_losses", (held(run, logits), np.zeros((1, 32, 64)), plain), (expected, expected), bound=1e-11 if bound < 1e-7 else bound)
+
+
+@check("WM-10", "WM-11", "WM-14", "WM-18", uses=["kl_losses"], level=0)
+def kl_matches(run: Run) -> None:
+    """Random logits from almost uniform to almost sure, with several floors; both results are the same number."""
+    options = [{}, {"free_nats": 0.0}, {"free_nats": 3.0, "latent_unimix": 0.3}]
+
+    @run.for_all(seed=seeds(), overrides=st.sampled_from(options), scale=st.sampled_from([0.1, 1.0, 10.0, 1e3]))
+    def _(seed: int, overrides: dict[str, Any], scale: float) -> None:
+        config = small_config(run.profile, run.dtype, **overrides)
+        posterior, prior = (held(run, normals(seed + i, 2, 4, config.stoch, config.classes, scale=scale)) for i in (0, 1))
+        log_q, log_p = (unimix_log_probs(logits, config.latent_unimix) for logits in (posterior, prior))
+        magnitude = 1 + (np.exp(log_q) * (np.abs(log_q) + np.abs(log_p))).sum((-2, -1))
+        expected = reference.kl_losses(posterior, prior, config)
+        run.expect("kl_losses", (posterior, prior, config), expected, magnitude=(magnitude, magnitude), bound=64 * run.u)
+
+
+@check("WM-14", "WM-18", uses=["kl_losses"], level=0)
+def kl_extremes(run: Run) -> None:
+    """Equal distributions are 0 nats apart and never less; a NaN shows in its own element, and no other."""
+    config = small_config(run.profile, run.dtype)
+    free = dataclasses.replace(config, free_nats=0.0)
+    logits = held(run, normals(run.seed, 4, config.stoch, config.classes, scale=2.0))
+    for name, loss in zip(("dynamics", "representation"), run.call("kl_losses", logits, logits, free), strict=True):
+        run.compare(f"{name} of equal distributions", loss, np.zeros(4), magnitude=1.0, bound=64 * run.u)
+        run.holds(f"{name} is not negative", np.asarray(loss) >= 0)
+    for argument in (0, 1):
+        arguments = [logits.copy(), np.zeros_like(logits)]
+        before = run.call("kl_losses", *arguments, config)
+        arguments[argument][1, 2, 0] = np.nan
+        with np.errstate(invalid="ignore"):
+            after = run.call("kl_losses", *arguments, config)
+        for name, clean, loss in zip(("dynamics", "representation"), before, after, strict=True):
+            run.exact(f"{name} with a NaN", loss, np.where(np.arange(4) == 1, np.nan, clean))
+
+
+@check("WM-2", "WM-3", "WM-4", "WM-5", uses=["reconstruction_losses"], level=0)
+def reconstruction_literals(run: Run) -> None:
+    """Vector 10 at 1 costs 1.954111 times the scale; Discrete((2, 3)) at (0, 2) ln 4 + ln 3, whatever the scale; a pixel 0.25."""
+    task = Spaces({"x": Vector(2), "kind": Discrete((2, 3)), "view": Image(2, 2, 1)}, ACTIONS)
+    kind = held(run, [[0.0, SURE, 0.0, 0.0, 0.0]])
+    predictions = {"x": np.array([[1.0, 0.0]]), "kind": kind, "view": np.full((1, 2, 2, 1), 0.5)}
+    view = np.array([[255, 0], [0, 51]], np.uint8).reshape(1, 2, 2, 1)
+    observations = {"x": np.array([[10, 0]], np.float32), "kind": np.array([[0, 2]]), "view": view}
+    for scale in (0.5, 1.0):
+        config = small_config(run.profile, run.dtype, vector_loss_scale=scale)
+        expected = {"x": [1.954111 * scale], "kind": [2.4849066498], "view": [0.75 + 0.09]}
+        expected_arrays = {key: np.array(value) for key, value in expected.items()}
+        run.expect("reconstruction_losses", (predictions, observations, task, config), expected_arrays, bound=1e-6 + 16 * run.u)
+
+
+@check("WM-2", "WM-3", "WM-4", "WM-5", "WM-18", "CON-24", uses=["reconstruction_losses"], level=0)
+def reconstruction_matches(run: Run) -> None:
+    """Random predictions and observations of any scale, two leading axes; one loss for each key, with predictions in float32 or better."""
+    config = small_config(run.profile, run.dtype)
+
+    @run.for_all(seed=seeds(), position=arrays(adversarial_numbers(finite=True), (2, 3, 3)), scale=st.sampled_from([0.1, 3.0, 100.0]))
+    def _(seed: int, position: np.ndarray, scale: float) -> None:
+        observations = random_observations(np.random.default_rng(seed), TASK, (2, 3)) | {"position": position.astype(np.float32)}
+        brightness = np.random.default_rng(seed + 3).random((2, 3, 4, 6, 3))
+        drawn = {"position": normals(seed, 2, 3, 3, scale=scale), "mode": normals(seed + 1, 2, 3, 5, scale=scale), "image": brightness}
+        predictions = {key: held(run, value) for key, value in drawn.items()}
+        magnitude = {
+            "position": ((np.abs(predictions["position"]) + np.log1p(np.abs(observations["position"].astype(float)))) ** 2).sum(-1),
+            "mode": 2 + 2 * np.abs(predictions["mode"]).max(-1),
+            "image": ((brightness + observations["image"] / 255.0) ** 2).sum((-3, -2, -1)),
+        }
+        others = {"reward": np.full((2, 3), np.nan), **observations}
+        expected = reference.reconstruction_losses(predictions, observations, TASK, config)
+        arguments = predictions, others, TASK, config
+        run.expect("reconstruction_losses", arguments, expected, magnitude=magnitude, bound=64 * run.u)
+
+
+@check("WM-18", uses=["reconstruction_losses"], level=0)
+def reconstruction_shows_nan(run: Run) -> None:
+    """A NaN in a prediction or an observation shows in the loss of its own key and step, and no other."""
+    config = small_config(run.profile, run.dtype)
+    observations = random_observations(run.rng(), TASK, (3,))
+    predictions = {"position": np.zeros((3, 3)), "mode": np.zeros((3, 5)), "image": np.zeros((3, 4, 6, 3))}
+    expected = reference.reconstruction_losses(predictions, observations, TASK, config)
+    for mapping, key in ((predictions, "image"), (predictions, "mode"), (observations, "position")):
+        spoiled = mapping[key].copy()
+        spoiled.reshape(3, -1)[1, 1] = np.nan
+        arguments = [mapping | {key: spoiled} if x is mapping else x for x in (predictions, observations)]
+        wanted = expected | {key: np.where(np.arange(3) == 1, np.nan, expected[key])}
+        run.expect("reconstruction_losses", (*arguments, TASK, config), wanted, bound=256 * run.u)
+
+
+@check("WM-19", "WM-3", "WM-4", "NET-4", "NET-6", "CON-8", uses=["reconstruction_losses"], level=0)
+def reconstruction_refuses(run: Run) -> None:
+    """Missing keys, shapes that do not fit, real numbers for a Discrete and anything but uint8 for an Image are refused."""
+    config = small_config(run.profile, run.dtype)
+    observations = random_observations(run.rng(), TASK, (3,))
+    predictions = {"position": np.zeros((3, 3)), "mode": np.zeros((3, 5)), "image": np.zeros((3, 4, 6, 3))}
+    for key in TASK.observations:
+        for mapping in (predictions, observations):
+            for wrong in (None, mapping[key][..., :-1], mapping[key][:1], mapping[key][0]):
+                changed = {name: value for name, value in mapping.items() if name != key} | ({} if wrong is None else {key: wrong})
+                arguments = [changed if x is mapping else x for x in (predictions, observations)]
+                run.refuses("reconstruction_losses", *arguments, TASK, config)
+    for key, real in (("mode", np.float32), ("image", np.float32), ("image", np.int64)):
+        run.refuses("reconstruction_losses", predictions, observations | {key: observations[key].astype(real)}, TASK, config)
+
+
+@check("WM-19", "CON-8", uses=["kl_losses"], level=0)
+def kl_refuses(run: Run) -> None:
+    """Logits of another shape than [..., stoch, classes], and two shapes that could be broadcast, are refused."""
+    config = small_config(run.profile, run.dtype)
+    S, C = config.stoch, config.classes
+    for wrong in ((4, S * C), (4, C, S), (4, S, C - 1), (4, S, 1), (4, 1, C), (1, S, C), (S, C), (5, S, C)):
+        run.refuses("kl_losses", np.zeros(wrong), np.zeros((4, S, C)), config)
+        run.refuses("kl_losses", np.zeros((4, S, C)), np.zeros(wrong), config)
+
+
+def constant_heads(run: Run, continue_logit: float) -> tuple[Problem, dict[str, np.ndarray]]:
+    """A problem whose weights are all zero, so that every prediction is the bias of its output layer, and these biases."""
+    problem = make_problem(run.seed, run.profile, "both", "mixed", run.dtype, **WEIGHTS)
+    rng = run.rng()
+    biases = {
+        name: round_to(rng.normal(size=value.shape), "bfloat16")
+        for name, value in problem.state["params"].items()
+        if name.startswith(("decoder/vector/out/", "decoder/image/out", "reward/out")) and name.endswith("bias")
+    } | {"continue/out/bias": np.array([continue_logit])}
+    params = {name: np.zeros_like(value) for name, value in problem.state["params"].items()} | biases
+    reward = np.array([[0, 1, -1, 3.3, 1e12], [-1e12, 20, 0.01, -7e4, 485165194]], np.float32)
+    changed = dataclasses.replace(problem, state=problem.state | {"params": params}, batch=problem.batch | {"reward": reward})
+    return changed, biases
+
+
+@check("WM-2", "WM-3", "WM-4", "WM-5", "WM-6", "WM-8", "WM-11", "WM-14", "WM-15", "WM-16", "WM-18", uses=["losses"], level=2)
+def losses_of_constant_predictions(run: Run) -> None:
+    """Where no prediction depends on the state, every loss is the plain mean over all steps, without weights; logits may be huge."""
+    for continue_logit in (6.0, 1000.0, -1000.0):
+        problem, biases = constant_heads(run, continue_logit)
+        batch, config = problem.batch, problem.config
+        logits, mode = biases["decoder/vector/out/mode/bias"], batch["mode"]
+        sigmoid = 1 / (1 + np.exp(-biases["decoder/image/out/bias"]))  # depth comes first
+        error = biases["decoder/vector/out/position/bias"] - np.sign(batch["position"]) * np.log1p(np.abs(batch["position"].astype(float)))
+        log_softmax = unimix_log_probs(biases["reward/out/bias"], 0.0)
+        target = (1.0 - batch["is_terminal"]) * (config.discount if config.continue_target == "discounted" else 1.0)
+        entries = [unimix_log_probs(part, 0.0) for part in (logits[:3], logits[3:])]
+        expected = {
+            "reconstruction/position": config.vector_loss_scale * (error**2).sum(-1),
+            "reconstruction/mode": -entries[0][mode[..., 0]] - entries[1][mode[..., 1]],
+            "reconstruction/depth": ((sigmoid[:1] - batch["depth"] / 255.0) ** 2).sum((-3, -2, -1)),
+            "reconstruction/image": ((sigmoid[1:] - batch["image"] / 255.0) ** 2).sum((-3, -2, -1)),
+            "reward": -(twohot(batch["reward"], exponential_bins(config.bins)) * log_softmax).sum(-1),
+            "continue": max(continue_logit, 0.0) - target * continue_logit + math.log1p(math.exp(-abs(continue_logit))),
+            "dynamics": np.full(target.shape, config.free_nats),
+            "representation": np.full(target.shape, config.free_nats),
+        }
+        actual = run.call("losses", *problem.loss_arguments)[1]["losses"]
+        run.holds("the names of the losses", set(actual) - {"actor", "critic", "replay_critic"} == set(expected))
+        for name, values in expected.items():
+            magnitude = abs(continue_logit) if name == "continue" else values.mean()
+            where = f"{name} with continue logit {continue_logit}"
+            run.compare(where, actual[name], values.mean(), magnitude=magnitude, bound=1e-12 if run.dtype == "float64" else 256 * run.u)
+
+
+@check("WM-1", "WM-6", "WM-8", "WM-9", "WM-15", "WM-16", "NET-1", uses=["losses"], level=2, dtypes=WHOLE)
+def losses_read_the_state_of_the_same_step(run: Run) -> None:
+    """With heads that depend strongly on memory and latents, each loss pairs state, reward, flag and observation of one step."""
+    problem = problem_of(run, "both", "mixed")
+    strong = ("reward/out/kernel", "continue/out/kernel", "decoder/vector/out/mode/kernel", "rssm/prior/out/kernel")
+    params = {name: value * 8 if name in strong else value for name, value in problem.state["params"].items()}
+    names = [name for name in agent.losses(*problem.loss_arguments)[1]["losses"] if name not in ("actor", "critic", "replay_critic")]
+    arguments = (params, *problem.loss_arguments[1:])
+    expected, actual = agent.losses(*arguments)[1]["losses"], run.call("losses", *arguments)[1]["losses"]
+    for name in names:
+        run.compare(name, actual[name], expected[name], magnitude=abs(expected[name]) + 1, bound=bound_of(run, 1e-10, 2e-4))
+
+
+def summed_kl(problem: Problem) -> np.ndarray:
+    """KL from posterior to prior [B, T], summed over the latents and not clipped."""
+    params, config, batch = problem.state["params"], problem.config, problem.batch
+    carry = {"deter": batch["deter"], "stoch": np.eye(config.classes)[batch["stoch"]]}
+    tokens = networks.encoder(params, batch, problem.spaces, config)
+    states = rssm.observe(params, carry, tokens, batch["prev_action"], batch["is_first"], problem.noise["posterior"], config)
+    return reference.kl_losses(states["logits"], rssm.prior(params, states["deter"], config), dataclasses.replace(config, free_nats=0.0))[0]
+
+
+def scaled(problem: Problem, scale: float) -> Problem:
+    """The problem with larger or smaller logits of posterior and prior."""
+    outputs = ("rssm/posterior/out/", "rssm/prior/out/")
+    params = {name: value * scale if name.startswith(outputs) else value for name, value in problem.state["params"].items()}
+    return dataclasses.replace(problem, state=problem.state | {"params": params})
+
+
+@functools.lru_cache(maxsize=16)
+def clipped_problem(seed: int, profile: str, dtype: str) -> Problem:
+    """Some steps lie clearly above the free nats and others clearly below, and no sample is near a class boundary."""
+    for attempt in range(100):
+        problem = scaled(make_problem(1000 * seed + attempt, profile, "vector", "continuous", dtype), 0.75)
+        above = summed_kl(problem) - problem.config.free_nats
+        if (np.abs(above) > 0.05).all() and 0.3 <= np.mean(above > 0) <= 0.7:
+            totals = {agent.losses(*nudged(problem, distance).loss_arguments)[0] for distance in (-1e-4, 1e-4)}
+            if len(totals) == 1:
+                return problem
+    raise RuntimeError("no problem with steps on both sides of the free nats was found")
+
+
+@check("WM-9", "WM-11", "WM-12", "WM-13", "WM-14", uses=["losses", "loss_derivatives"], level=2, dtypes=WHOLE)
+def kl_gradients_match(run: Run) -> None:
+    """With some steps above the free nats and some below: values and derivatives of both losses by all that may move them."""
+    problem = clipped_problem(run.seed, run.profile, run.dtype)
+    directions = {
+        label: direction
+        for label, direction in unit_directions(problem, run.seed).items()
+        if label in ("encoder", "core", "posterior", "prior")
+    }
+    names = ("dynamics", "representation")
+
+    def means(params: Any) -> np.ndarray:
+        losses = agent.losses(params, *problem.loss_arguments[1:])[1]["losses"]
+        return np.array([losses[name] for name in names])
+
+    params = problem.state["params"]
+    expected = np.array([agent.directional_derivative(means, params, direction, 1e-5) for direction in directions.values()]).T
+    losses = run.call("losses", *problem.loss_arguments)[1]["losses"]
+    run.compare("losses", np.array([losses[name] for name in names]), means(params), bound=bound_of(run, 1e-10, 2e-4))
+    actual = run.call("loss_derivatives", *problem.loss_arguments, list(directions.values()))
+    for name, derivatives in zip(names, expected, strict=True):
+        where = f"derivatives of {name} by {', '.join(directions)}"
+        run.compare(where, actual[name], derivatives, magnitude=np.abs(derivatives).max() + 1e-3, bound=bound_of(run, 1e-6, 5e-3))
+
+
+@check("WM-14", uses=["losses", "loss_derivatives"], level=2)
+def free_nats_leave_no_gradient(run: Run) -> None:
+    """Where posterior and prior are close everywhere, both losses are exactly the free nats and move with no parameter."""
+    problem = scaled(make_problem(run.seed, run.profile, "vector", "continuous", run.dtype), 2.0**-6)
+    losses = run.call("losses", *problem.loss_arguments)[1]["losses"]
+    derivatives = run.call("loss_derivatives", *problem.loss_arguments, list(unit_directions(problem, run.seed).values()))
+    for name in ("dynamics", "representation"):
+        run.exact(name, losses[name], problem.config.free_nats)
+        run.exact(f"derivatives of {name}", derivatives[name], np.zeros_like(derivatives[name]))
+
+
+@check("WM-12", "WM-13", "RSSM-23", uses=["loss_derivatives"], level=2)
+def constants_of_the_kl(run: Run) -> None:
+    """Where every step is a reset: dynamics moves with prior and core alone, representation with posterior, encoder and core alone."""
+    problem = scaled(make_problem(run.seed, run.profile, "vector", "continuous", run.dtype), 8.0)
+    batch = problem.batch | {"is_first": np.ones_like(problem.batch["is_first"])}
+    problem = dataclasses.replace(problem, batch=batch)
+    directions = unit_directions(problem, run.seed)
+    derivatives = run.call("loss_derivatives", *problem.loss_arguments, list(directions.values()))
+    moving = {"dynamics": ("prior", "core"), "representation": ("posterior", "encoder", "core")}
+    for name, labels in moving.items():
+        for label, derivative in zip(directions, derivatives[name], strict=True):
+            if label in labels:
+                run.holds(f"{name} moves with {label}", derivative != 0)
+            elif not label.startswith("all"):
+                run.exact(f"derivative of {name} by {label}", derivative, 0.0)

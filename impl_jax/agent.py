@@ -1,0 +1,205 @@
+"""The agent: parameters, training state, policy step, losses and train step. Chapter: spec/10-agent.md."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.lax import stop_gradient
+from jax.typing import ArrayLike
+
+from impl_jax import behavior, networks, returns, rssm
+from impl_jax.checks import require, require_shape
+from impl_jax.distributions import bernoulli_mean, symexp_twohot_mean
+from impl_jax.layers import Params, exact_dtype, truncated_normal
+from impl_jax.optimizer import initial_optimizer_state, optimizer_step_with_metrics
+from impl_jax.transforms import exponential_bins, real
+from impl_jax.world_model import continue_target, world_model_losses
+from spec import Config, Parameter, Spaces
+
+Arrays = Mapping[str, jax.Array]
+State = dict[str, Any]
+
+
+def initial_parameters(table: Mapping[str, Parameter], uniforms: Mapping[str, ArrayLike]) -> dict[str, jax.Array]:
+    """Parameters from the table and a uniform number for each entry of each kernel, in the dtype of the uniforms. [AGT-3] to [AGT-6]"""
+    dtype = jnp.result_type(*(real(uniform) for uniform in uniforms.values()))
+    params = {}
+    for name, entry in table.items():
+        if entry.initializer == "truncated_normal":
+            require(name in uniforms, "uniforms", f"the name {name!r}", f"{len(uniforms)} others")
+            uniform = jnp.asarray(uniforms[name])
+            require_shape(f"uniforms {name}", uniform, *entry.shape)
+            params[name] = truncated_normal(uniform, entry.fan_in, entry.outscale)
+        else:
+            params[name] = jnp.full(entry.shape, 0.0 if entry.initializer == "zeros" else 1.0, dtype)
+    return params
+
+
+def initial_state(params: Params) -> State:
+    """A fresh training state of these parameters, with memory of its own for the slow critic. [AGT-7], [AGT-8]"""
+    dtype = jnp.result_type(*params.values())
+    return {
+        "params": dict(params),
+        "slow_critic": {name: jnp.array(value, copy=True) for name, value in params.items() if name.startswith("critic/")},
+        "optimizer": initial_optimizer_state(params),
+        "return_range": {"low": jnp.zeros((), dtype), "high": jnp.zeros((), dtype)},
+    }
+
+
+def policy_step(
+    params: Params,
+    carry: Arrays,
+    prev_action: jax.Array,
+    observation: Arrays,
+    is_first: jax.Array,
+    noise: Arrays,
+    spaces: Spaces,
+    config: Config,
+) -> tuple[dict[str, jax.Array], jax.Array]:
+    """One acting step of N rows: (carry, flat action [N, A]). [AGT-11] to [AGT-13]
+
+    carry: {"deter" [N, D], "stoch" [N, S, C]}; prev_action [N, A]; noise {"posterior" [N, S], "action" [N, K]}.
+    """
+    tokens = networks.encoder(params, observation, spaces, config)
+    carry, _ = rssm.observe_step(params, carry, tokens, prev_action, is_first, noise["posterior"], config)
+    outputs = networks.actor(params, networks.feature(carry["deter"], carry["stoch"]), spaces, config)
+    return carry, behavior.sample_action(outputs, noise["action"], spaces, config)
+
+
+def losses(
+    params: Params,
+    slow_critic: Arrays,
+    return_range: tuple[ArrayLike, ArrayLike],
+    batch: Arrays,
+    noise: Arrays,
+    spaces: Spaces,
+    config: Config,
+) -> tuple[jax.Array, dict[str, Any]]:
+    """The total loss and everything that a train step reports. [AGT-14] to [AGT-28]
+
+    return_range: (low, high) before this step; noise: {"posterior" [B, T, S], "prior" [N, H, S], "action" [N, H, K]}.
+
+    Returns:
+      total: scalar.
+      aux: "losses" (name -> unweighted mean), "return_range" (updated), "deter" [B, T, D] and "stoch" [B, T, S, C] (constants), "metrics".
+    """
+    slow_critic, return_range, batch, noise = stop_gradient((dict(slow_critic), tuple(return_range), dict(batch), dict(noise)))
+    states = _observe_batch(params, batch, noise["posterior"], spaces, config)
+    each = world_model_losses(params, batch, states, spaces, config)
+    behavior_losses, updated_range, metrics = _behavior_losses(params, slow_critic, return_range, batch, states, noise, spaces, config)
+    each |= behavior_losses
+    means = {name: jnp.mean(loss) if loss.size else jnp.zeros((), loss.dtype) for name, loss in each.items()}
+    total = jnp.asarray(sum(getattr(config, f"{name.split('/')[0]}_scale") * mean for name, mean in means.items()))
+    latents = {"deter": states["deter"], "stoch": states["stoch"]}
+    return total, stop_gradient({"losses": means, "return_range": updated_range, **latents, "metrics": metrics})
+
+
+def _observe_batch(params: Params, batch: Arrays, uniform: jax.Array, spaces: Spaces, config: Config) -> dict[str, jax.Array]:
+    """The posterior states of a train batch, from the stored latents of the context step. [AGT-14], [AGT-15]"""
+    B = batch["is_first"].shape[0]
+    require_shape("batch deter", batch["deter"], B, config.deter)
+    require_shape("batch stoch", batch["stoch"], B, config.stoch)
+    tokens = networks.encoder(params, batch, spaces, config)
+    carry = {"deter": batch["deter"], "stoch": jax.nn.one_hot(batch["stoch"], config.classes, dtype=jnp.float32)}
+    return rssm.observe(params, carry, tokens, batch["prev_action"], batch["is_first"], uniform, config)
+
+
+def _behavior_losses(
+    params: Params,
+    slow_critic: Arrays,
+    return_range: tuple[jax.Array, jax.Array],
+    batch: Arrays,
+    states: Arrays,
+    noise: Arrays,
+    spaces: Spaces,
+    config: Config,
+) -> tuple[dict[str, jax.Array], tuple[jax.Array, jax.Array], dict[str, jax.Array]]:
+    """Losses of actor and critic, the updated return range, and metrics. Arrays of imagination have time first here. [AGT-17] to [AGT-25]"""
+    B, T = batch["is_first"].shape
+    exact, bins = exact_dtype(config), exponential_bins(config.bins)
+    constants = stop_gradient(dict(params))
+    feature = networks.feature(states["deter"], states["stoch"])
+
+    features, action = _imagine_batch(constants, states, noise, spaces, config)
+    reward = symexp_twohot_mean(networks.reward_head(constants, features, config), bins)
+    continue_ = bernoulli_mean(networks.continue_head(constants, features, config))
+    if config.start_continue == "true":
+        continue_ = continue_.at[0].set(continue_target(batch["is_terminal"], config).reshape(-1))
+    # One pass with gradients serves the critic's loss and, as a constant, the baseline and the bootstrap values.
+    logits = networks.critic(params, features, config)
+    value = stop_gradient(symexp_twohot_mean(logits, bins))
+    slow_logits = networks.critic(slow_critic, features, config)
+
+    discount = config.imagined_discount
+    imagined = returns.lambda_return(reward.T, continue_.T, value.T, discount, config.return_lambda)
+    weight = returns.cumulative_weights(continue_.T, discount).T
+    updated_range = returns.update_return_range(*return_range, imagined, config)
+    scale = returns.return_scale(*updated_range, config.return_limit)
+    target = imagined.T
+
+    outputs = jax.tree.map(lambda x: x[:-1], networks.actor(params, features, spaces, config))
+    entropy = behavior.action_entropy(outputs, spaces, config)
+    log_prob = behavior.action_log_prob(outputs, action, spaces, config)
+    each = {
+        "actor": behavior.actor_loss(log_prob, entropy, target, value[:-1], weight, scale, config),
+        "critic": behavior.critic_loss(logits[:-1], slow_logits[:-1], target, weight, config),
+        "replay_critic": jnp.zeros((B, 0), exact),
+    }
+    if T > 1:
+        flags = (batch["is_last"], batch["is_terminal"])
+        reward_seen = batch["reward"].astype(exact)
+        replayed = returns.replay_lambda_return(reward_seen, *flags, target[0].reshape(B, T), config.discount, config.return_lambda)
+        live = networks.critic(params, feature, config)
+        # Imagination starts at the posterior states, so the slow critic has judged them already.
+        slow = slow_logits[0].reshape(B, T, -1)
+        each["replay_critic"] = behavior.replay_critic_loss(live[:, :-1], slow[:, :-1], replayed, batch["is_last"][:, :-1], config)
+    metrics = {
+        "return_scale": scale,
+        "return_mean": jnp.mean(imagined),
+        "value_mean": jnp.mean(value[:-1]),
+        "reward_mean": jnp.mean(reward[1:]),
+        "continue_mean": jnp.mean(continue_[1:]),
+        "weight_mean": jnp.mean(weight),
+        "actor_entropy": jnp.mean(entropy),
+    }
+    return each, updated_range, metrics
+
+
+def _imagine_batch(
+    constants: Params, states: Arrays, noise: Arrays, spaces: Spaces, config: Config
+) -> tuple[jax.Array, jax.Array]:
+    """Features [H+1, N, F] and actions [H, N, A] of imagination from every posterior state. [AGT-17], [AGT-18]"""
+    N = states["deter"].shape[0] * states["deter"].shape[1]
+    H = config.imagination_horizon
+    require_shape("noise prior", noise["prior"], N, H, config.stoch)
+    require_shape("noise action", noise["action"], N, H, spaces.action_noise_size)
+    carry = stop_gradient({key: states[key].reshape(N, *states[key].shape[2:]) for key in ("deter", "stoch")})
+    uniform, action_noise = (noise[key].swapaxes(0, 1) for key in ("prior", "action"))
+
+    def policy(feature: jax.Array, t: jax.Array) -> jax.Array:
+        return behavior.sample_action(networks.actor(constants, feature, spaces, config), action_noise[t], spaces, config)
+
+    return rssm.imagine_features(constants, carry, policy, uniform, config)
+
+
+def train_step(state: State, batch: Arrays, noise: Arrays, spaces: Spaces, config: Config) -> tuple[State, dict[str, Any]]:
+    """One gradient step: (new state, aux of `losses` with the optimizer's metrics beside the others). [AGT-29] to [AGT-31]
+
+    The returned latents are those of the parameters before the update.
+    """
+    return_range = (state["return_range"]["low"], state["return_range"]["high"])
+
+    def total(params: Params) -> tuple[jax.Array, dict[str, Any]]:
+        return losses(params, state["slow_critic"], return_range, batch, noise, spaces, config)
+
+    (loss, aux), gradients = jax.value_and_grad(total, has_aux=True)(state["params"])
+    params, optimizer, metrics = optimizer_step_with_metrics(state["params"], gradients, state["optimizer"], config)
+    low, high = aux["return_range"]
+    new = {
+        "params": params,
+        "slow_critic": behavior.update_slow_critic(state["slow_critic"], params, config.slow_critic_decay),
+        "optimizer": optimizer,
+        "return_range": {"low": low, "high": high},
+    }
+    return new, aux | {"metrics": aux["metrics"] | metrics | {"total_loss": loss}}

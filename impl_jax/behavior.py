@@ -1,0 +1,151 @@
+"""Actor and critic: actions, their log-probability and entropy, and the three losses. Chapter: spec/08-behavior.md.
+
+The losses are elementwise and not weighted by their scales [BEH-17]; they accept any leading axes in place of [N, H], so that training can
+keep time first.
+"""
+
+from collections.abc import Iterator, Mapping
+
+import jax
+import jax.numpy as jnp
+from jax.lax import stop_gradient
+from jax.typing import ArrayLike
+
+from impl_jax.checks import require, require_same_shape, require_shape
+from impl_jax.distributions import (
+    bounded_normal,
+    categorical_entropy,
+    categorical_log_prob,
+    categorical_sample,
+    normal_entropy,
+    normal_log_prob,
+    normal_sample,
+    symexp_twohot_loss,
+    symexp_twohot_mean,
+    unimix_log_probs,
+)
+from impl_jax.transforms import exponential_bins, real
+from spec import Config, Discrete, Spaces
+
+Outputs = Mapping[str, Mapping[str, jax.Array]]
+
+
+def _check_outputs(outputs: Outputs, spaces: Spaces) -> tuple[int, ...]:
+    """The leading axes of the actor's outputs, after checking keys and shapes. [BEH-23]"""
+    require(set(outputs) == set(spaces.actions), "outputs", f"the action keys {list(spaces.actions)}", f"{sorted(outputs)}")
+    leading: tuple[int, ...] | None = None
+    for key, space in spaces.actions.items():
+        parts = ("logits",) if isinstance(space, Discrete) else ("mean", "std")
+        for part in parts:
+            require(part in outputs[key], f"outputs of {key!r}", f"the entry {part!r}", f"{sorted(outputs[key])}")
+            shape = outputs[key][part].shape
+            leading = shape[:-1] if leading is None else leading
+            require_shape(f"outputs of {key!r}, {part}", outputs[key][part], *leading, space.encoded_size)
+    assert leading is not None  # a task has at least one action
+    return leading
+
+
+def _distributions(outputs: Outputs, spaces: Spaces, config: Config) -> Iterator[tuple[bool, int, int, tuple[jax.Array, ...]]]:
+    """The independent parts of the policy in flat order: (is categorical, length in the action, length in the noise, parameters).
+
+    A categorical has its log-probabilities, a vector of normals mean and standard deviation. [BEH-2], [BEH-4], [BEH-22]
+    """
+    for key, space in spaces.actions.items():
+        if isinstance(space, Discrete):
+            start = 0
+            for classes in space.classes:
+                segment = outputs[key]["logits"][..., start : start + classes]
+                yield True, classes, 1, (unimix_log_probs(segment, config.actor_unimix),)
+                start += classes
+        else:
+            mean, std = outputs[key]["mean"], outputs[key]["std"]
+            yield False, space.size, space.size, bounded_normal(mean, std, config.actor_min_std, config.actor_max_std)
+
+
+def sample_action(outputs: Outputs, noise: jax.Array, spaces: Spaces, config: Config) -> jax.Array:
+    """A flat action [..., A] from noise [..., K], neither clipped nor squashed, constant. [BEH-1] to [BEH-5]"""
+    leading = _check_outputs(outputs, spaces)
+    require_shape("noise", noise, *leading, spaces.action_noise_size)
+    actions, start = [], 0
+    for categorical, _, count, parameters in _distributions(outputs, spaces, config):
+        part = noise[..., start : start + count]
+        actions.append(categorical_sample(*parameters, part[..., 0]) if categorical else normal_sample(*parameters, part))
+        start += count
+    return jnp.concatenate(actions, -1)
+
+
+def action_log_prob(outputs: Outputs, action: jax.Array, spaces: Spaces, config: Config) -> jax.Array:
+    """The log-probability of a raw flat action [..., A], a constant, summed over everything: [...], nats. [BEH-5], [BEH-6]"""
+    leading = _check_outputs(outputs, spaces)
+    require_shape("action", action, *leading, spaces.action_size)
+    total, start = [], 0
+    for categorical, length, _, parameters in _distributions(outputs, spaces, config):
+        part = action[..., start : start + length]
+        log_prob = categorical_log_prob(*parameters, part) if categorical else jnp.sum(normal_log_prob(*parameters, part), -1)
+        total.append(log_prob)
+        start += length
+    return sum(total[1:], start=total[0])
+
+
+def action_entropy(outputs: Outputs, spaces: Spaces, config: Config) -> jax.Array:
+    """The entropy of the policy, summed over everything: [...], nats. [BEH-7]"""
+    _check_outputs(outputs, spaces)
+    total = [
+        categorical_entropy(*parameters) if categorical else jnp.sum(normal_entropy(parameters[1]), -1)
+        for categorical, _, _, parameters in _distributions(outputs, spaces, config)
+    ]
+    return sum(total[1:], start=total[0])
+
+
+def actor_loss(
+    log_prob: jax.Array,
+    entropy: jax.Array,
+    returns: jax.Array,
+    value: jax.Array,
+    weight: jax.Array,
+    scale: ArrayLike,
+    config: Config,
+) -> jax.Array:
+    """Reinforce with a bonus for entropy, [N, H] each. Section "Actor learning". [BEH-9], [BEH-10]"""
+    require_same_shape(log_prob=log_prob, entropy=entropy, returns=returns, value=value, weight=weight)
+    require_shape("scale", jnp.asarray(scale))
+    log_prob, entropy = real(log_prob), real(entropy)
+    advantage = stop_gradient((real(returns) - real(value)) / real(scale))
+    return -stop_gradient(real(weight)) * (advantage * log_prob + config.entropy_scale * entropy)
+
+
+def _value_loss(logits: jax.Array, slow_logits: jax.Array, returns: jax.Array, config: Config) -> jax.Array:
+    """Cross-entropy with the return, and with the mean of the slow critic as a target of its own. Section "Critic learning"."""
+    require_shape("logits", logits, *returns.shape, config.bins)
+    require_same_shape(logits=logits, slow_logits=slow_logits)
+    bins = exponential_bins(config.bins)
+    slow_mean = stop_gradient(symexp_twohot_mean(slow_logits, bins))
+    return symexp_twohot_loss(logits, returns, bins) + config.slow_critic_scale * symexp_twohot_loss(logits, slow_mean, bins)
+
+
+def critic_loss(logits: jax.Array, slow_logits: jax.Array, returns: jax.Array, weight: jax.Array, config: Config) -> jax.Array:
+    """The critic's loss in imagination: [N, H, bins] twice and [N, H] twice -> [N, H]. [BEH-12], [BEH-13]"""
+    require_same_shape(returns=returns, weight=weight)
+    return stop_gradient(real(weight)) * _value_loss(logits, slow_logits, returns, config)
+
+
+def replay_critic_loss(
+    logits: jax.Array, slow_logits: jax.Array, returns: jax.Array, is_last: jax.Array, config: Config
+) -> jax.Array:
+    """The critic's loss on replayed steps 0 .. T-2: [B, T-1, bins] twice and [B, T-1] twice -> [B, T-1]. [BEH-14], [BEH-15]"""
+    require_same_shape(returns=returns, is_last=is_last)
+    loss = _value_loss(logits, slow_logits, returns, config)
+    return (1.0 - jnp.asarray(is_last).astype(loss.dtype)) * loss
+
+
+def update_slow_critic(slow: Mapping[str, jax.Array], critic: Mapping[str, jax.Array], decay: float) -> dict[str, jax.Array]:
+    """decay * slow + (1 - decay) * critic for every name of the slow critic, in its precision. [BEH-19], [BEH-20]
+
+    Raises:
+      ValueError: names or shapes that differ.
+    """
+    names = {name for name in critic if name.startswith("critic/")}
+    require(set(slow) == names, "slow", f"the names {sorted(names)}", f"{sorted(slow)}")
+    for name in slow:
+        require_shape(f"critic {name}", critic[name], *slow[name].shape)
+    return {name: (decay * value + (1.0 - decay) * critic[name].astype(value.dtype)).astype(value.dtype) for name, value in slow.items()}

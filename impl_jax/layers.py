@@ -1,0 +1,220 @@
+"""The parts that networks are built from. Chapter: spec/03-layers.md.
+
+Parameters keep their own precision; every function converts them to the dtype of `x`, which the caller has put into the compute dtype, and
+returns that dtype. [LAY-1]
+"""
+
+import functools
+import math
+from collections.abc import Mapping
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.typing import ArrayLike
+
+from impl_jax import convolutions
+from impl_jax.checks import require, require_shape
+from impl_jax.transforms import real
+from spec import Config
+
+Params = Mapping[str, jax.Array]
+
+# Standard deviation of the standard normal truncated to two deviations.
+_TRUNCATED_STD = 0.8796256610342398
+
+
+def compute_dtype(config: Config) -> jnp.dtype:
+    """The dtype of activations. [CON-23]"""
+    return jnp.dtype(config.compute_dtype)
+
+
+def exact_dtype(config: Config) -> jnp.dtype:
+    """The dtype of everything that must not be coarser than float32. [CON-22], [CON-23]"""
+    return jnp.promote_types(compute_dtype(config), jnp.float32)
+
+
+@jax.custom_vjp
+def product(x: jax.Array, kernel: jax.Array) -> jax.Array:
+    """[..., in] x [in, out] -> [..., out], in the dtype of x; the gradient of the kernel in the dtype of the kernel. [CON-23]"""
+    return lax.dot_general(x, kernel.astype(x.dtype), (((x.ndim - 1,), (0,)), ((), ())), precision=convolutions.precision(x.dtype))
+
+
+def _product_bwd(saved: tuple[jax.Array, jax.Array], g: jax.Array) -> tuple[jax.Array, jax.Array]:
+    x, kernel = saved
+    dx = lax.dot_general(g, kernel.astype(x.dtype), (((g.ndim - 1,), (1,)), ((), ())), precision=convolutions.precision(x.dtype))
+    return dx, product_kernel_gradient(x, g, kernel.dtype)
+
+
+def product_kernel_gradient(x: jax.Array, g: jax.Array, dtype: jnp.dtype) -> jax.Array:
+    """[..., in], [..., out] -> [in, out], summed over the leading axes."""
+    axes = tuple(range(x.ndim - 1))
+    return lax.dot_general(x, g, ((axes, axes), ((), ())), precision=convolutions.precision(x.dtype), preferred_element_type=dtype)
+
+
+product.defvjp(lambda x, kernel: (product(x, kernel), (x, kernel)), _product_bwd)
+
+
+@jax.custom_vjp
+def block_product(x: jax.Array, kernel: jax.Array) -> jax.Array:
+    """One product for each block: [G, n, in/G] x [G, in/G, out/G] -> [G, n, out/G]."""
+    return lax.dot_general(x, kernel.astype(x.dtype), (((2,), (1,)), ((0,), (0,))), precision=convolutions.precision(x.dtype))
+
+
+def _block_product_bwd(saved: tuple[jax.Array, jax.Array], g: jax.Array) -> tuple[jax.Array, jax.Array]:
+    x, kernel = saved
+    dx = lax.dot_general(g, kernel.astype(x.dtype), (((2,), (2,)), ((0,), (0,))), precision=convolutions.precision(x.dtype))
+    return dx, block_kernel_gradient(x, g, kernel.dtype)
+
+
+def block_kernel_gradient(x: jax.Array, g: jax.Array, dtype: jnp.dtype) -> jax.Array:
+    """[G, n, in/G], [G, n, out/G] -> [G, in/G, out/G]."""
+    dimensions = (((1,), (1,)), ((0,), (0,)))
+    return lax.dot_general(x, g, dimensions, precision=convolutions.precision(x.dtype), preferred_element_type=dtype)
+
+
+block_product.defvjp(lambda x, kernel: (block_product(x, kernel), (x, kernel)), _block_product_bwd)
+
+
+@jax.custom_vjp
+def add_bias(x: jax.Array, bias: jax.Array) -> jax.Array:
+    """x + bias, where the bias broadcasts; its gradient is summed in its own dtype. [CON-23]"""
+    return x + bias.astype(x.dtype)
+
+
+def _add_bias_bwd(bias: jax.Array, g: jax.Array) -> tuple[jax.Array, jax.Array]:
+    shape = (1,) * (g.ndim - bias.ndim) + bias.shape
+    axes = tuple(axis for axis in range(g.ndim) if shape[axis] == 1)
+    return g, jnp.sum(g.astype(bias.dtype), axis=axes).reshape(bias.shape)
+
+
+add_bias.defvjp(lambda x, bias: (add_bias(x, bias), bias), _add_bias_bwd)
+
+
+def to_blocks(x: jax.Array, blocks: int) -> jax.Array:
+    """[n, in] -> [G, n, in/G]: block-major, so that each block is a matrix of its own."""
+    return x.reshape(x.shape[0], blocks, -1).transpose(1, 0, 2)
+
+
+def from_blocks(x: jax.Array) -> jax.Array:
+    """The inverse of `to_blocks`."""
+    return x.transpose(1, 0, 2).reshape(x.shape[1], -1)
+
+
+def linear(x: jax.Array, kernel: jax.Array, bias: jax.Array) -> jax.Array:
+    """[..., in] -> [..., out] with kernel [in, out] and bias [out]. [LAY-2]"""
+    require(kernel.ndim == 2, "kernel", "2 axes [in, out]", f"shape {list(kernel.shape)}")
+    require(x.ndim >= 1 and x.shape[-1] == kernel.shape[0], "x", f"a last axis of {kernel.shape[0]}", f"shape {list(x.shape)}")
+    require_shape("bias", bias, kernel.shape[1])
+    return add_bias(product(x, kernel), bias)
+
+
+def block_linear(x: jax.Array, kernel: jax.Array, bias: jax.Array) -> jax.Array:
+    """[..., in] -> [..., out] with kernel [G, in/G, out/G] and bias [out]: each contiguous piece of x by itself. [LAY-3]"""
+    require(kernel.ndim == 3, "kernel", "3 axes [G, in/G, out/G]", f"shape {list(kernel.shape)}")
+    blocks, inputs, outputs = kernel.shape
+    require(x.ndim >= 1 and x.shape[-1] == blocks * inputs, "x", f"a last axis of {blocks * inputs}", f"shape {list(x.shape)}")
+    require_shape("bias", bias, blocks * outputs)
+    rows = to_blocks(x.reshape(-1, x.shape[-1]), blocks)
+    return add_bias(from_blocks(block_product(rows, kernel)).reshape(*x.shape[:-1], -1), bias)
+
+
+def rms_norm(x: jax.Array, scale: jax.Array, epsilon: float) -> jax.Array:
+    """x / sqrt(mean(x^2) + epsilon) * scale over the last axis, in float32 or better, rounded once at the end. [LAY-4]"""
+    require_shape("scale", scale, x.shape[-1])
+    return rms_norm_over(x, scale, epsilon, (-1,))
+
+
+def rms_norm_over(x: jax.Array, scale: jax.Array, epsilon: float, axes: tuple[int, ...]) -> jax.Array:
+    """`rms_norm` over several axes, with a scale that broadcasts."""
+    wide = real(x)
+    count = math.prod(x.shape[axis] for axis in axes)
+    # The factor goes in before the square, so that the sum of many large squares cannot overflow where their mean does not.
+    mean_square = jnp.sum(jnp.square(wide * count**-0.5), axis=axes, keepdims=True)
+    return (wide * lax.rsqrt(mean_square + epsilon) * scale.astype(wide.dtype)).astype(x.dtype)
+
+
+def silu(x: jax.Array) -> jax.Array:
+    """x * sigmoid(x), elementwise. [LAY-5]"""
+    return x * jax.nn.sigmoid(x)
+
+
+@functools.partial(jax.checkpoint, static_argnums=(2,))
+def activate(x: jax.Array, scale: jax.Array, epsilon: float) -> jax.Array:
+    """RMSNorm and SiLU. The gradient computes both again from x: cheaper than keeping what lies between them in memory."""
+    return silu(rms_norm(x, scale, epsilon))
+
+
+def convolution(x: jax.Array, kernel: jax.Array, bias: jax.Array, stride: int) -> jax.Array:
+    """5 x 5 cross-correlation with zeros around: [..., H, W, in] -> [..., H/stride, W/stride, out]. [LAY-6]"""
+    require(stride in (1, 2), "stride", "1 or 2", stride)
+    images = _images(x, kernel, bias)
+    if stride == 2:
+        require(not (x.shape[-3] % 2 or x.shape[-2] % 2), "x", "even sides at stride 2", f"shape {list(x.shape)}")
+    y = convolutions.same(images, kernel) if stride == 1 else convolutions.halve(images, kernel)
+    return add_bias(y.reshape(*x.shape[:-3], *y.shape[1:]), bias)
+
+
+def transposed_convolution(x: jax.Array, kernel: jax.Array, bias: jax.Array) -> jax.Array:
+    """The adjoint of the convolution of stride 2: [..., H, W, in] -> [..., 2H, 2W, out]. [LAY-7]"""
+    y = convolutions.double(_images(x, kernel, bias), kernel)
+    return add_bias(y.reshape(*x.shape[:-3], *y.shape[1:]), bias)
+
+
+def upsampled_convolution(x: jax.Array, kernel: jax.Array, bias: jax.Array) -> jax.Array:
+    """convolution(upsample(x), kernel, bias, 1) without the upsampled image: [..., H, W, in] -> [..., 2H, 2W, out]. [LAY-14]"""
+    y = convolutions.same(_images(x, kernel, bias), convolutions.upsampling_kernel(kernel))
+    y = convolutions.depth_to_space(y)
+    return add_bias(y.reshape(*x.shape[:-3], *y.shape[1:]), bias)
+
+
+def _images(x: jax.Array, kernel: jax.Array, bias: jax.Array) -> jax.Array:
+    """x with its leading axes as one, after the checks of [LAY-15]."""
+    require(kernel.ndim == 4 and kernel.shape[:2] == (5, 5), "kernel", "shape [5, 5, in, out]", f"shape {list(kernel.shape)}")
+    require(x.ndim >= 3, "x", "at least 3 axes [H, W, in]", f"shape {list(x.shape)}")
+    require(x.shape[-1] == kernel.shape[2], "x", f"a last axis of {kernel.shape[2]}", f"shape {list(x.shape)}")
+    require_shape("bias", bias, kernel.shape[3])
+    return x.reshape(-1, *x.shape[-3:])
+
+
+def max_pool(x: jax.Array) -> jax.Array:
+    """The maximum of each 2 x 2 window: [..., H, W, C] -> [..., H/2, W/2, C]; its gradient goes to the first maximum. [LAY-12]"""
+    require(x.ndim >= 3, "x", "at least 3 axes [H, W, C]", f"shape {list(x.shape)}")
+    *leading, height, width, channels = x.shape
+    require(not (height % 2 or width % 2), "x", "even sides", f"shape {list(x.shape)}")
+    x = x.reshape(*leading, height // 2, 2, width // 2, 2, channels)
+
+    def first_maximum(a: jax.Array, b: jax.Array) -> jax.Array:
+        return jnp.where((a >= b) | jnp.isnan(a), a, b)
+
+    upper = first_maximum(x[..., 0, :, 0, :], x[..., 0, :, 1, :])
+    return first_maximum(first_maximum(upper, x[..., 1, :, 0, :]), x[..., 1, :, 1, :])
+
+
+def upsample(x: jax.Array) -> jax.Array:
+    """Every pixel twice in both axes: [..., H, W, C] -> [..., 2H, 2W, C]. [LAY-13]"""
+    require(x.ndim >= 3, "x", "at least 3 axes [H, W, C]", f"shape {list(x.shape)}")
+    *leading, height, width, channels = x.shape
+    x = jnp.broadcast_to(x[..., :, None, :, None, :], (*leading, height, 2, width, 2, channels))
+    return x.reshape(*leading, 2 * height, 2 * width, channels)
+
+
+def dense(params: Params, name: str, x: jax.Array, epsilon: float) -> jax.Array:
+    """Linear, RMSNorm, SiLU with the parameters under one name: [..., in] -> [..., out]. [LAY-8]"""
+    return activate(linear(x, params[f"{name}/kernel"], params[f"{name}/bias"]), params[f"{name}/scale"], epsilon)
+
+
+def mlp(params: Params, name: str, x: jax.Array, layers: int, epsilon: float) -> jax.Array:
+    """The dense layers name/hidden0, name/hidden1, ...: [..., in] -> [..., out]. [LAY-8]"""
+    require(layers >= 1, "layers", "at least 1", layers)
+    for layer in range(layers):
+        x = dense(params, f"{name}/hidden{layer}", x, epsilon)
+    return x
+
+
+def truncated_normal(uniform: ArrayLike, fan_in: int, outscale: float) -> jax.Array:
+    """Initial weights from uniforms, of their shape and dtype, with standard deviation outscale / sqrt(fan_in). [LAY-9], [LAY-11]"""
+    require(fan_in >= 1, "fan_in", "at least 1", fan_in)
+    uniform = real(uniform)
+    normal = math.sqrt(2) * lax.erf_inv((2.0 * uniform - 1.0) * math.erf(math.sqrt(2)))
+    return jnp.clip(normal, -2.0, 2.0) * (outscale / (_TRUNCATED_STD * math.sqrt(fan_in)))

@@ -1,0 +1,179 @@
+"""The networks around the recurrent model: encoder, decoder, heads. Chapter: spec/05-networks.md.
+
+They return raw outputs, those of the decoder and the heads in float32 or better. [NET-26]
+"""
+
+from collections.abc import Mapping
+
+import jax
+import jax.numpy as jnp
+
+from impl_jax.checks import require, require_shape, require_trailing
+from impl_jax.layers import (
+    Params,
+    activate,
+    block_linear,
+    compute_dtype,
+    convolution,
+    dense,
+    exact_dtype,
+    linear,
+    max_pool,
+    mlp,
+    transposed_convolution,
+    upsampled_convolution,
+)
+from impl_jax.transforms import symlog
+from spec import Config, Discrete, Image, Spaces, Vector
+
+Observations = Mapping[str, jax.Array]
+
+
+def feature(deter: jax.Array, stoch: jax.Array) -> jax.Array:
+    """The model state that all heads read: [..., D], [..., S, C] -> [..., D + S*C]. [NET-1], [CON-4]"""
+    require_shape("stoch", stoch, *deter.shape[:-1], "S", "C")
+    return jnp.concatenate([deter, stoch.reshape(*stoch.shape[:-2], -1).astype(deter.dtype)], -1)
+
+
+def encoder(params: Params, observations: Observations, spaces: Spaces, config: Config) -> jax.Array:
+    """Raw observations [..., *array_shape] -> tokens [..., E]: vector features, then flat image features. [NET-2] to [NET-12]
+
+    Raises:
+      ValueError: a missing key, or an observation of the wrong shape or dtype. [NET-27]
+    """
+    leading = _leading_axes(observations, spaces)
+    tokens = []
+    if spaces.vectors:
+        x = jnp.concatenate([_vector_input(observations[key], space, config) for key, space in spaces.vectors.items()], -1)
+        tokens.append(mlp(params, "encoder/vector", x.astype(compute_dtype(config)), config.encoder_layers, config.norm_epsilon))
+    if spaces.images:
+        x = jnp.concatenate([observations[key] for key in spaces.images], -1).astype(exact_dtype(config))
+        x = (x / 255.0 - 0.5).astype(compute_dtype(config))
+        tokens.append(_image_encoder(params, x, config).reshape(*leading, -1))
+    return jnp.concatenate(tokens, -1)
+
+
+def _leading_axes(observations: Observations, spaces: Spaces) -> tuple[int, ...]:
+    """The leading axes that all observations share, after checking them. [NET-2], [NET-4], [NET-6], [NET-27]"""
+    leading: tuple[int, ...] | None = None
+    for key, space in spaces.observations.items():
+        require(key in observations, "observations", f"the key {key!r}", f"the keys {sorted(observations)}")
+        x = observations[key]
+        if isinstance(space, Image):
+            require(x.dtype == jnp.uint8, f"observation {key!r}", "dtype uint8", x.dtype)
+        elif isinstance(space, Discrete):
+            require(jnp.issubdtype(x.dtype, jnp.integer), f"observation {key!r}", "an integer dtype", x.dtype)
+        require_trailing(f"observation {key!r}", x, *space.array_shape)
+        if leading is None:
+            leading = x.shape[: x.ndim - len(space.array_shape)]
+        require_shape(f"observation {key!r}", x, *leading, *space.array_shape)
+    assert leading is not None  # a task has at least one observation
+    return leading
+
+
+def onehots(x: jax.Array, space: Discrete, dtype: jnp.dtype) -> jax.Array:
+    """Class indices [..., len(classes)] as joined one-hots [..., sum(classes)]. [CON-26]"""
+    return jnp.concatenate([jax.nn.one_hot(x[..., entry], classes, dtype=dtype) for entry, classes in enumerate(space.classes)], -1)
+
+
+def _vector_input(x: jax.Array, space: Vector | Discrete, config: Config) -> jax.Array:
+    """What the encoder reads of one observation that is not an image. [NET-3], [CON-24]"""
+    dtype = exact_dtype(config)
+    return onehots(x, space, dtype) if isinstance(space, Discrete) else symlog(x.astype(dtype))
+
+
+def _image_encoder(params: Params, x: jax.Array, config: Config) -> jax.Array:
+    """[..., H, W, c] -> [..., h0, w0, c0]. [NET-7] to [NET-9]"""
+    x = x.reshape(-1, *x.shape[-3:])
+    for index in range(len(config.cnn_multipliers)):
+        name = f"encoder/image/conv{index}"
+        kernel, bias, scale = (params[f"{name}/{part}"] for part in ("kernel", "bias", "scale"))
+        if index == 0 and config.cnn_outer:
+            x = convolution(x, kernel, bias, 1)
+        elif config.cnn_sampling == "strided":
+            x = convolution(x, kernel, bias, 2)
+        else:
+            x = max_pool(convolution(x, kernel, bias, 1))
+        x = activate(x, scale, config.norm_epsilon)
+    return x
+
+
+def decoder(params: Params, feature: jax.Array, spaces: Spaces, config: Config) -> dict[str, jax.Array]:
+    """Reconstructions from features [..., F]: key -> symlog vectors, logits, or images in [0, 1]. [NET-13] to [NET-19]"""
+    x = _feature_input(feature, config)
+    result = {}
+    if spaces.vectors:
+        hidden = mlp(params, "decoder/vector", x, config.decoder_layers, config.norm_epsilon)
+        result |= {key: _output(params, f"decoder/vector/out/{key}", hidden, config) for key in spaces.vectors}
+    if spaces.images:
+        images = _image_decoder(params, x.reshape(-1, x.shape[-1]), spaces, config)
+        images = images.reshape(*x.shape[:-1], *images.shape[1:])
+        start = 0
+        for key, space in spaces.images.items():
+            result[key] = images[..., start : start + space.channels]
+            start += space.channels
+    return {key: result[key] for key in spaces.observations}
+
+
+def _image_decoder(params: Params, x: jax.Array, spaces: Spaces, config: Config) -> jax.Array:
+    """Features [n, F] -> [n, H, W, image channels] in [0, 1]. [NET-15] to [NET-18]"""
+    image = next(iter(spaces.images.values()))
+    height, width = image.height // 2**config.halvings, image.width // 2**config.halvings
+    deter, stoch = x[:, : config.deter], x[:, config.deter :]
+
+    from_deter = block_linear(deter, params["decoder/image/deter/kernel"], params["decoder/image/deter/bias"])
+    from_deter = from_deter.reshape(-1, config.blocks, height, width, from_deter.shape[-1] // (config.blocks * height * width))
+    from_deter = from_deter.transpose(0, 2, 3, 1, 4).reshape(-1, height, width, config.blocks * from_deter.shape[-1])
+    hidden = dense(params, "decoder/image/stoch_hidden", stoch, config.norm_epsilon)
+    from_stoch = linear(hidden, params["decoder/image/stoch/kernel"], params["decoder/image/stoch/bias"]).reshape(from_deter.shape)
+    y = activate(from_deter + from_stoch, params["decoder/image/stem/scale"], config.norm_epsilon)
+
+    double = transposed_convolution if config.cnn_sampling == "strided" else upsampled_convolution
+    for index in range(len(config.cnn_multipliers) - 1):
+        name = f"decoder/image/conv{index}"
+        y = activate(double(y, params[f"{name}/kernel"], params[f"{name}/bias"]), params[f"{name}/scale"], config.norm_epsilon)
+    kernel, bias = params["decoder/image/out/kernel"], params["decoder/image/out/bias"]
+    y = convolution(y, kernel, bias, 1) if config.cnn_outer else double(y, kernel, bias)
+    return jax.nn.sigmoid(y.astype(exact_dtype(config)))
+
+
+def _feature_input(feature: jax.Array, config: Config) -> jax.Array:
+    require_trailing("feature", feature, config.feature_size)
+    return feature.astype(compute_dtype(config))
+
+
+def _output(params: Params, name: str, x: jax.Array, config: Config) -> jax.Array:
+    """A last linear layer, in float32 or better. [NET-26]"""
+    return linear(x, params[f"{name}/kernel"], params[f"{name}/bias"]).astype(exact_dtype(config))
+
+
+def _head(params: Params, name: str, feature: jax.Array, layers: int, config: Config) -> jax.Array:
+    hidden = mlp(params, name, _feature_input(feature, config), layers, config.norm_epsilon)
+    return _output(params, f"{name}/out", hidden, config)
+
+
+def reward_head(params: Params, feature: jax.Array, config: Config) -> jax.Array:
+    """Features [..., F] -> logits [..., bins] of the symexp-twohot reward. [NET-20]"""
+    return _head(params, "reward", feature, config.reward_layers, config)
+
+
+def continue_head(params: Params, feature: jax.Array, config: Config) -> jax.Array:
+    """Features [..., F] -> one logit [...]. [NET-21]"""
+    return _head(params, "continue", feature, config.continue_layers, config)[..., 0]
+
+
+def critic(params: Params, feature: jax.Array, config: Config) -> jax.Array:
+    """Features [..., F] -> logits [..., bins] of the symexp-twohot value; also with the slow critic's parameters. [NET-20], [NET-23]"""
+    return _head(params, "critic", feature, config.critic_layers, config)
+
+
+def actor(params: Params, feature: jax.Array, spaces: Spaces, config: Config) -> dict[str, dict[str, jax.Array]]:
+    """Features [..., F] -> key -> raw "logits", or raw "mean" and "std". [NET-22]"""
+    hidden = mlp(params, "actor", _feature_input(feature, config), config.actor_layers, config.norm_epsilon)
+    return {
+        key: {
+            part: _output(params, f"actor/out/{key}/{part}", hidden, config)
+            for part in (("logits",) if isinstance(space, Discrete) else ("mean", "std"))
+        }
+        for key, space in spaces.actions.items()
+    }

@@ -1,0 +1,211 @@
+"""Adaptive gradient clipping and LaProp. Chapter: spec/09-optimizer.md.
+
+The plain functions of the chapter work on one tensor. `adaptive_gradient_clipping` and `scale_by_laprop` are the same as ordinary optax
+transformations over any tree of parameters, for use on their own:
+
+    optax.chain(adaptive_gradient_clipping(0.3), scale_by_laprop(), optax.scale_by_learning_rate(4e-5))
+"""
+
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jax.typing import ArrayLike
+
+from impl_jax.checks import require, require_same_shape
+from impl_jax.layers import exact_dtype
+from impl_jax.transforms import real
+from spec import Config
+
+Arrays = Mapping[str, jax.Array]
+
+_SMALL = 1 << 16  # numbers in a tensor that is cheap to copy
+_DEAD_ZONE = 1e-16  # gradients below it count as zero: their squares would leave the normal numbers of float32 [OPT-9]
+
+
+def norm(x: ArrayLike) -> jax.Array:
+    """The root of the sum of squares over all entries, which neither overflows nor vanishes because the squares do. [OPT-3]"""
+    x = real(x)
+    peak = jnp.max(jnp.abs(x))
+    return peak * jnp.sqrt(jnp.sum(jnp.square(x / jnp.where(peak == 0, 1.0, peak))))
+
+
+def _clip_factor(gradient: jax.Array, parameter: jax.Array, clip: float, epsilon: float) -> tuple[jax.Array, jax.Array]:
+    """What to multiply a gradient with, and its norm. [OPT-1], [OPT-4], [OPT-5]"""
+    length, size = norm(gradient), norm(parameter)
+    threshold = clip * jnp.maximum(size, epsilon)
+    # The divisor is replaced where the factor is not used: 0/0 must not arise.
+    factor = jnp.where(length <= threshold, 1.0, threshold / jnp.where(length == 0, 1.0, length))
+    return jnp.where(jnp.isfinite(length) & jnp.isfinite(size), factor, jnp.nan), length
+
+
+def adaptive_gradient_clip(gradient: ArrayLike, parameter: ArrayLike, clip: float, epsilon: float) -> jax.Array:
+    """The gradient, not longer than clip * max(epsilon, norm of its parameter): [...], [...] -> [...]. [OPT-1] to [OPT-5]"""
+    gradient, parameter = real(gradient), real(parameter)
+    require_same_shape(gradient=gradient, parameter=parameter)
+    return gradient * _clip_factor(gradient, parameter, clip, epsilon)[0]
+
+
+def learning_rate(step: ArrayLike, config: Config) -> Any:
+    """The learning rate of an update with `step` updates before it: a float for an int, else an array. [OPT-6]"""
+    if config.warmup_steps == 0:
+        return config.learning_rate
+    if isinstance(step, int):
+        return config.learning_rate * min(1.0, step / config.warmup_steps)
+    slope = config.learning_rate / config.warmup_steps  # formed in float64 [OPT-19]
+    return jnp.minimum(jnp.asarray(step).astype(exact_dtype(config)) * slope, config.learning_rate)
+
+
+def _correction(beta: float, step: ArrayLike, dtype: jnp.dtype) -> jax.Array:
+    """1 - beta^(step + 1), without the cancellation of forming the power first. [OPT-11]"""
+    if beta == 0:
+        return jnp.ones((), dtype)
+    return -jnp.expm1((jnp.asarray(step).astype(dtype) + 1.0) * math.log(beta))
+
+
+def _laprop(
+    gradient: jax.Array, second_moment: jax.Array, momentum: jax.Array, step: ArrayLike, beta1: float, beta2: float, epsilon: float
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    for name, beta in (("beta1", beta1), ("beta2", beta2)):
+        require(beta < 1, name, "below 1: the bias correction would be 0/0", beta)
+    gradient = jnp.where(jnp.abs(gradient) < _DEAD_ZONE, 0.0, gradient)
+    second_moment = beta2 * second_moment + (1.0 - beta2) * jnp.square(gradient)
+    root = jnp.sqrt(second_moment / _correction(beta2, step, gradient.dtype)) + epsilon
+    normalized = jnp.where(gradient == 0, 0.0, gradient / root)
+    momentum = beta1 * momentum + (1.0 - beta1) * normalized
+    return momentum / _correction(beta1, step, gradient.dtype), second_moment, momentum
+
+
+def laprop(
+    gradient: ArrayLike, second_moment: ArrayLike, momentum: ArrayLike, step: ArrayLike, config: Config
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """(update, second moment, momentum) of one tensor; the update without learning rate and minus sign. [OPT-8] to [OPT-14]
+
+    Raises:
+      ValueError: a beta of 1, or shapes that differ.
+    """
+    gradient = real(gradient)
+    second_moment, momentum = (jnp.asarray(x).astype(gradient.dtype) for x in (second_moment, momentum))
+    require_same_shape(gradient=gradient, second_moment=second_moment, momentum=momentum)
+    return _laprop(gradient, second_moment, momentum, step, config.beta1, config.beta2, config.laprop_epsilon)
+
+
+def optimizer_step(
+    params: Arrays, gradients: Arrays, state: Mapping[str, Any], config: Config
+) -> tuple[dict[str, jax.Array], dict[str, Any]]:
+    """One update of every tensor: (params, state), the state being {"step", "second_moment", "momentum"}. [OPT-15] to [OPT-20]
+
+    Raises:
+      ValueError: names or shapes that differ.
+    """
+    params, state, _ = optimizer_step_with_metrics(params, gradients, state, config)
+    return params, state
+
+
+def optimizer_step_with_metrics(
+    params: Arrays, gradients: Arrays, state: Mapping[str, Any], config: Config
+) -> tuple[dict[str, jax.Array], dict[str, Any], dict[str, jax.Array]]:
+    """`optimizer_step`, and the norms of the whole gradient and update and the share of tensors that were clipped."""
+    _check_names(params, gradients, state)
+    step, rate = state["step"], learning_rate(state["step"], config)
+    new: dict[str, dict[str, jax.Array]] = {"params": {}, "second_moment": {}, "momentum": {}}
+    lengths, moves, factors = [], [], []
+    for names in _groups(params):
+        sources = (params, gradients, state["second_moment"], state["momentum"])
+        parameter, gradient, *moments = (jnp.stack([source[name] for name in names]) for source in sources)
+        clip_factor = jax.vmap(lambda g, p: _clip_factor(g, p, config.agc_clip, config.agc_epsilon))
+        factor, length = clip_factor(gradient, parameter)
+        gradient = gradient * factor.reshape(-1, *(1,) * (gradient.ndim - 1))
+        update, second_moment, momentum = laprop(gradient, *moments, step, config)
+        for kind, stacked in (("params", parameter - rate * update), ("second_moment", second_moment), ("momentum", momentum)):
+            new[kind] |= {name: stacked[index] for index, name in enumerate(names)}
+        lengths.append(length)
+        moves.append(jnp.sum(jnp.square(update)))
+        factors.append(factor)
+    metrics = {
+        "gradient_norm": norm(jnp.concatenate(lengths)),
+        "update_norm": jnp.sqrt(jnp.sum(jnp.stack(moves))) * rate,
+        "clip_fraction": jnp.mean((jnp.concatenate(factors) < 1).astype(jnp.float32)),
+    }
+    params, second_moment, momentum = ({name: new[kind][name] for name in params} for kind in ("params", "second_moment", "momentum"))
+    return params, {"step": step + 1, "second_moment": second_moment, "momentum": momentum}, metrics
+
+
+def _groups(params: Arrays) -> list[list[str]]:
+    """Names of tensors that are updated together: the small ones of one shape, so that there is less to compile and to launch.
+
+    Large tensors stay alone, because stacking copies them.
+    """
+    groups: dict[tuple[Any, ...], list[str]] = {}
+    for name, parameter in params.items():
+        alone = (name,) if parameter.size > _SMALL else ()
+        groups.setdefault((*parameter.shape, parameter.dtype, *alone), []).append(name)
+    return list(groups.values())
+
+
+def _check_names(params: Arrays, gradients: Arrays, state: Mapping[str, Any]) -> None:
+    """[OPT-18]"""
+    for kind, arrays in (("gradients", gradients), ("second_moment", state["second_moment"]), ("momentum", state["momentum"])):
+        different = sorted(set(params) ^ set(arrays))
+        require(not different, kind, "the names of the parameters", f"a difference in {different}")
+        for name, parameter in params.items():
+            require_same_shape(**{f"parameter {name}": parameter, f"{kind} {name}": arrays[name]})
+
+
+def initial_optimizer_state(params: Arrays) -> dict[str, Any]:
+    """Zeros of the parameters' shapes and step 0. [OPT-13]"""
+    zeros = {kind: {name: jnp.zeros_like(parameter) for name, parameter in params.items()} for kind in ("second_moment", "momentum")}
+    return {"step": jnp.zeros((), jnp.int32), **zeros}
+
+
+def adaptive_gradient_clipping(clip: float, epsilon: float = 1e-3) -> optax.GradientTransformation:
+    """`adaptive_gradient_clip` of every tensor of a tree by itself. [OPT-2]
+
+    Unlike `optax.adaptive_grad_clip` it compares whole tensors, not units.
+    """
+
+    def update(updates: optax.Updates, state: optax.OptState, params: optax.Params | None = None) -> tuple[optax.Updates, optax.OptState]:
+        require(params is not None, "params", "the parameters, to compare the gradients with", None)
+        return jax.tree.map(lambda g, p: adaptive_gradient_clip(g, p, clip, epsilon).astype(g.dtype), updates, params), state
+
+    return optax.GradientTransformation(lambda params: optax.EmptyState(), update)
+
+
+class LaPropState(NamedTuple):
+    """The state of `scale_by_laprop`: updates made so far, and both averages, uncorrected."""
+
+    step: jax.Array
+    second_moment: optax.Updates
+    momentum: optax.Updates
+
+
+def scale_by_laprop(beta1: float = 0.9, beta2: float = 0.99, epsilon: float = 1e-20) -> optax.GradientTransformation:
+    """LaProp: normalized by their own recent size first, averaged over time second. [OPT-8] to [OPT-12]"""
+
+    def init(params: optax.Params) -> LaPropState:
+        def zeros() -> optax.Updates:
+            return jax.tree.map(lambda p: jnp.zeros_like(p, dtype=jnp.promote_types(p.dtype, jnp.float32)), params)
+
+        return LaPropState(jnp.zeros((), jnp.int32), zeros(), zeros())
+
+    def update(updates: optax.Updates, state: LaPropState, params: optax.Params | None = None) -> tuple[optax.Updates, LaPropState]:
+        leaves, tree = jax.tree.flatten(updates)
+        moments = zip(leaves, tree.flatten_up_to(state.second_moment), tree.flatten_up_to(state.momentum), strict=True)
+        results = [_laprop(real(g), v, m, state.step, beta1, beta2, epsilon) for g, v, m in moments]
+        scaled = [result[0].astype(leaf.dtype) for result, leaf in zip(results, leaves, strict=True)]
+        second_moment, momentum = (tree.unflatten([result[index] for result in results]) for index in (1, 2))
+        return tree.unflatten(scaled), LaPropState(state.step + 1, second_moment, momentum)
+
+    return optax.GradientTransformation(init, update)
+
+
+def dreamer_optimizer(config: Config) -> optax.GradientTransformation:
+    """`optimizer_step` as one optax transformation."""
+    return optax.chain(
+        adaptive_gradient_clipping(config.agc_clip, config.agc_epsilon),
+        scale_by_laprop(config.beta1, config.beta2, config.laprop_epsilon),
+        optax.scale_by_learning_rate(lambda step: learning_rate(step, config)),
+    )

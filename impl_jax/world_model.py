@@ -1,0 +1,104 @@
+"""World model losses: predictions, dynamics and representation. Chapter: spec/06-world-model.md."""
+
+from collections.abc import Mapping
+
+import jax
+import jax.numpy as jnp
+from jax.lax import stop_gradient
+
+from impl_jax import networks, rssm
+from impl_jax.checks import require, require_same_shape, require_shape
+from impl_jax.distributions import (
+    bernoulli_loss,
+    categorical_kl,
+    categorical_log_prob,
+    mse_loss,
+    symexp_twohot_loss,
+    symlog_mse_loss,
+    unimix_log_probs,
+)
+from impl_jax.layers import Params, exact_dtype
+from impl_jax.transforms import exponential_bins
+from spec import Config, Discrete, Image, Spaces
+
+Arrays = Mapping[str, jax.Array]
+
+
+def continue_target(is_terminal: jax.Array, config: Config) -> jax.Array:
+    """1 - is_terminal [...], times gamma for a "discounted" continue head; float32 or better. [WM-7]"""
+    alive = 1.0 - is_terminal.astype(exact_dtype(config))
+    return alive * config.discount if config.continue_target == "discounted" else alive
+
+
+def kl_losses(posterior_logits: jax.Array, prior_logits: jax.Array, config: Config) -> tuple[jax.Array, jax.Array]:
+    """(dynamics, representation) [...] in nats: KL of [..., S, C], summed over latents, then at least free_nats. [WM-10] to [WM-14]
+
+    Section "World model learning", losses L_dyn and L_rep.
+    """
+    require_shape("posterior_logits", posterior_logits, *posterior_logits.shape[:-2], config.stoch, config.classes)
+    require_same_shape(posterior_logits=posterior_logits, prior_logits=prior_logits)
+    posterior, prior = (unimix_log_probs(logits, config.latent_unimix) for logits in (posterior_logits, prior_logits))
+
+    def clipped(p: jax.Array, q: jax.Array) -> jax.Array:
+        kl = jnp.sum(categorical_kl(p, q), axis=-1)
+        # Selected, not a maximum: below the free nats the gradient is exactly zero, and a NaN stays.
+        return jnp.where(kl < config.free_nats, jnp.asarray(config.free_nats, kl.dtype), kl)
+
+    return clipped(stop_gradient(posterior), prior), clipped(posterior, stop_gradient(prior))
+
+
+def reconstruction_losses(predictions: Arrays, observations: Arrays, spaces: Spaces, config: Config) -> dict[str, jax.Array]:
+    """key -> [...]: squared symlog error, cross-entropy in nats, or squared brightness error. [WM-2] to [WM-5], [WM-17]
+
+    Raises:
+      ValueError: a missing key, or a wrong shape or dtype. [WM-19]
+    """
+    result = {}
+    for key, space in spaces.observations.items():
+        for name, mapping in (("predictions", predictions), ("observations", observations)):
+            require(key in mapping, name, f"the key {key!r}", f"the keys {sorted(mapping)}")
+        prediction, x = predictions[key], observations[key]
+        leading = x.shape[: x.ndim - len(space.array_shape)]
+        require_shape(f"observation {key!r}", x, *leading, *space.array_shape)
+        size = space.array_shape if isinstance(space, Image) else (space.encoded_size,)
+        require_shape(f"prediction {key!r}", prediction, *leading, *size)
+        if isinstance(space, Image):
+            require(x.dtype == jnp.uint8, f"observation {key!r}", "dtype uint8", x.dtype)
+            target = x.astype(exact_dtype(config)) / 255.0
+            result[key] = jnp.sum(mse_loss(prediction, target), axis=(-3, -2, -1))
+        elif isinstance(space, Discrete):
+            require(jnp.issubdtype(x.dtype, jnp.integer), f"observation {key!r}", "an integer dtype", x.dtype)
+            result[key] = -_discrete_log_prob(prediction, x, space)
+        else:
+            result[key] = jnp.sum(symlog_mse_loss(prediction, x.astype(exact_dtype(config)), config.vector_loss_scale), axis=-1)
+    return result
+
+
+def _discrete_log_prob(logits: jax.Array, x: jax.Array, space: Discrete) -> jax.Array:
+    """Log-probability of the classes x [..., entries] under joined logits, summed over the entries. [WM-3]"""
+    onehots = networks.onehots(x, space, logits.dtype)
+    total, start = jnp.zeros(x.shape[:-1], logits.dtype), 0
+    for classes in space.classes:
+        segment = slice(start, start + classes)
+        total += categorical_log_prob(unimix_log_probs(logits[..., segment], 0.0), onehots[..., segment])
+        start += classes
+    return total
+
+
+def world_model_losses(params: Params, batch: Arrays, states: Arrays, spaces: Spaces, config: Config) -> dict[str, jax.Array]:
+    """All losses of the world model by name, [B, T] each, not weighted. [WM-1], [WM-6], [WM-8], [WM-9], [WM-15], [WM-16]
+
+    states: what `observe` returned, {"deter" [B, T, D], "stoch" [B, T, S, C], "logits" [B, T, S, C]}.
+    """
+    for key in ("reward", "is_terminal"):
+        require(key in batch, "batch", f"the key {key!r}", f"the keys {sorted(batch)}")
+    feature = networks.feature(states["deter"], states["stoch"])
+    bins = exponential_bins(config.bins)
+    reconstruction = reconstruction_losses(networks.decoder(params, feature, spaces, config), batch, spaces, config)
+    dynamics, representation = kl_losses(states["logits"], rssm.prior(params, states["deter"], config), config)
+    return {f"reconstruction/{key}": loss for key, loss in reconstruction.items()} | {
+        "reward": symexp_twohot_loss(networks.reward_head(params, feature, config), batch["reward"], bins),
+        "continue": bernoulli_loss(networks.continue_head(params, feature, config), continue_target(batch["is_terminal"], config)),
+        "dynamics": dynamics,
+        "representation": representation,
+    }

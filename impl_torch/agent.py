@@ -1,0 +1,217 @@
+"""The agent: initial state, policy step, losses, train step. Chapter: spec/10-agent.md."""
+
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from impl_torch.behavior import (
+    action_entropy,
+    action_log_prob,
+    actor_loss,
+    critic_loss,
+    replay_critic_loss,
+    sample_action,
+    update_slow_critic,
+)
+from impl_torch.distributions import bernoulli_mean, symexp_twohot_mean
+from impl_torch.layers import Params, truncated_normal
+from impl_torch.networks import Observations, actor, continue_head, critic, encoder, feature, reward_head
+from impl_torch.optimizer import optimizer_step
+from impl_torch.returns import cumulative_weights, lambda_return, replay_lambda_return, return_scale, update_return_range
+from impl_torch.rssm import Carry, imagine_features, observe, observe_step, prepare
+from impl_torch.shapes import expect_keys, expect_shape, wide_dtype
+from impl_torch.transforms import standard_bins
+from impl_torch.world_model import continue_target, world_model_losses
+from spec import Config, Parameter, Spaces
+
+Range = tuple[Tensor, Tensor]
+State = Mapping[str, Any]
+
+
+def initial_parameters(table: Mapping[str, Parameter], uniforms: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Every parameter of the table, from uniforms in the shape of each kernel. [AGT-1] [AGT-3] to [AGT-6]"""
+    expect_keys("uniforms", uniforms, (name for name, entry in table.items() if entry.initializer == "truncated_normal"))
+    like = next(iter(uniforms.values()))
+    params = {}
+    for name, entry in table.items():
+        if entry.initializer == "truncated_normal":
+            expect_shape(f"uniforms[{name!r}]", uniforms[name], entry.shape)
+            params[name] = truncated_normal(uniforms[name], entry.fan_in, entry.outscale)
+        else:
+            params[name] = like.new_full(entry.shape, 1.0 if entry.initializer == "ones" else 0.0)
+    return params
+
+
+def initial_state(params: Mapping[str, Tensor]) -> dict[str, Any]:
+    """A fresh training state. [AGT-7] [AGT-8] [OPT-13]"""
+    zero = next(iter(params.values())).new_zeros(())
+    return {
+        "params": dict(params),
+        "slow_critic": {name: x.detach().clone() for name, x in params.items() if name.startswith("critic/")},
+        "optimizer": {"step": 0, **{moment: {name: torch.zeros_like(x) for name, x in params.items()} for moment in ("second_moment", "momentum")}},
+        "return_range": {"low": zero, "high": zero.clone()},
+    }
+
+
+@torch.no_grad()
+def policy_step(
+    params: Params,
+    carry: Carry,
+    prev_action: Tensor,
+    observation: Observations,
+    is_first: Tensor,
+    noise: Mapping[str, Tensor],
+    spaces: Spaces,
+    config: Config,
+) -> tuple[dict[str, Tensor], Tensor]:
+    """One acting step of N rows: the new carry and the flat action [N, A]. [AGT-11] [AGT-12] [AGT-13]
+
+    carry of N rows, prev_action [N, A], observation {key: [N, ...]}, is_first [N], noise {"posterior" [N, S], "action" [N, K]}.
+    """
+    params = prepare(params, config)
+    tokens = encoder(params, observation, spaces, config)
+    carry, _ = observe_step(params, carry, tokens, prev_action, is_first, noise["posterior"], config)
+    outputs = actor(params, feature(carry["deter"], carry["stoch"]), spaces, config)
+    return dict(carry), sample_action(outputs, noise["action"], spaces, config)
+
+
+def losses(
+    params: Params,
+    slow_critic: Params,
+    return_range: Range,
+    batch: Observations,
+    noise: Mapping[str, Tensor],
+    spaces: Spaces,
+    config: Config,
+) -> tuple[Tensor, dict[str, Any]]:
+    """The total loss of a train step and everything else that comes out of it. [AGT-14] to [AGT-28] [RET-3] to [RET-6] [RET-11] [BEH-11] [BEH-16]
+
+    return_range: (low, high); batch: observations [B, T, ...], "reward", "is_first", "is_last", "is_terminal" [B, T], "prev_action" [B, T, A],
+    "deter" [B, D], "stoch" [B, S] class indices; noise: "posterior" [B, T, S], "prior" [N, H, S], "action" [N, H, K].
+    aux: "losses" {name: scalar}, "return_range", "deter" [B, T, D], "stoch" [B, T, S, C] and "metrics" {name: scalar}.
+    """
+    expect_keys("batch", batch, (*spaces.observations, "reward", "is_first", "is_last", "is_terminal", "prev_action", "deter", "stoch"))
+    expect_keys("noise", noise, ("posterior", "prior", "action"))
+    params, slow_critic = prepare(params, config), prepare(slow_critic, config)
+    B, T = batch["reward"].shape
+    H = config.imagination_horizon
+    dtype = wide_dtype(config)
+    bins = standard_bins(config.bins, dtype, batch["reward"].device)
+
+    # World model.
+    start = {"deter": batch["deter"].to(dtype), "stoch": F.one_hot(batch["stoch"].long(), config.classes).to(dtype)}
+    tokens = encoder(params, {key: batch[key] for key in spaces.observations}, spaces, config)
+    states = observe(params, start, tokens, batch["prev_action"], batch["is_first"], noise["posterior"], config)
+    values: dict[str, Tensor] = world_model_losses(params, batch, states, spaces, config)
+
+    # Imagination. The actor's outputs are kept with their gradients, so that its loss needs no second pass over the same states.
+    constants = {name: states[name].detach() for name in ("deter", "stoch")}
+    outputs = []
+
+    def policy(state: Tensor, t: int) -> Tensor:
+        with torch.enable_grad():
+            outputs.append(actor(params, state, spaces, config))
+        return sample_action(outputs[-1], noise["action"][:, t], spaces, config)
+
+    features, actions = imagine_features(params, {name: x.flatten(0, 1) for name, x in constants.items()}, policy, noise["prior"], config)
+    logits = _over_time(lambda x: critic(params, x, config), features[:H])
+    with torch.no_grad():
+        slow_logits = _over_time(lambda x: critic(slow_critic, x, config), features[:H])
+        reward = _over_time(lambda x: symexp_twohot_mean(reward_head(params, x, config), bins), features[1:])
+        reward = F.pad(reward, (1, 0))  # the reward of state 0 has been earned: no formula reads it
+        continue_ = _over_time(lambda x: bernoulli_mean(continue_head(params, x, config)), features)
+        if config.start_continue == "true":
+            continue_[:, 0] = continue_target(batch["is_terminal"], config).flatten()
+        last = symexp_twohot_mean(critic(params, features[H], config), bins)
+        value = torch.cat([symexp_twohot_mean(logits, bins), last.unsqueeze(1)], 1)
+
+    # Returns.
+    returns = lambda_return(reward, continue_, value, config.imagined_discount, config.return_lambda)
+    weight = cumulative_weights(continue_, config.imagined_discount)
+    low, high = update_return_range(*return_range, returns, config)
+    scale = return_scale(low, high, config.return_limit)
+
+    # Actor and critic.
+    policies = {key: {name: torch.stack([output[key][name] for output in outputs], 1) for name in outputs[0][key]} for key in spaces.actions}
+    log_prob = action_log_prob(policies, torch.stack(actions, 1), spaces, config)
+    entropy = action_entropy(policies, spaces, config)
+    values["actor"] = actor_loss(log_prob, entropy, returns, value[:, :H], weight, scale, config)
+    values["critic"] = critic_loss(logits, slow_logits, returns, weight, config)
+    if T > 1:
+        values["replay_critic"] = _replay_critic_loss(params, slow_critic, states, returns[:, 0].view(B, T), batch, config)
+
+    means = {name: x.mean() for name, x in values.items()}
+    means.setdefault("replay_critic", returns.new_zeros(()))
+    total = torch.stack([loss_scale(name, config) * mean for name, mean in means.items()]).sum()
+    metrics = {
+        "return_scale": scale,
+        "return_mean": returns.mean(),
+        "value_mean": value[:, :H].mean(),
+        "reward_mean": reward[:, 1:].mean(),
+        "continue_mean": continue_[:, 1:].mean(),
+        "weight_mean": weight.mean(),
+        "actor_entropy": entropy.detach().mean(),
+    }
+    detached = {name: mean.detach() for name, mean in means.items()}
+    return total, {"losses": detached, "return_range": (low, high), **constants, "metrics": metrics}
+
+
+def _over_time(head: Callable[[Tensor], Tensor], features: list[Tensor]) -> Tensor:
+    """A head at t imagined states [N, F] each -> [N, t, ...]: on the CPU step by step, in the cache; elsewhere all at once."""
+    if features[0].device.type == "cpu":
+        return torch.stack([head(x) for x in features], 1)
+    return head(torch.stack(features)).transpose(0, 1)
+
+
+def _replay_critic_loss(
+    params: Params, slow_critic: Params, states: Mapping[str, Tensor], annotation: Tensor, batch: Observations, config: Config
+) -> Tensor:
+    """[B, T-1], with gradients into the states. [AGT-25]"""
+    state = feature(states["deter"], states["stoch"])[:, :-1]
+    with torch.no_grad():
+        slow_logits = critic(slow_critic, state, config)
+        reward, is_last, is_terminal = batch["reward"], batch["is_last"], batch["is_terminal"]
+        returns = replay_lambda_return(reward, is_last, is_terminal, annotation, config.discount, config.return_lambda)
+    return replay_critic_loss(critic(params, state, config), slow_logits, returns, is_last[:, :-1], config)
+
+
+def loss_scale(name: str, config: Config) -> float:
+    """The weight of a loss in the total. [AGT-26]"""
+    return getattr(config, f"{name.split('/')[0]}_scale")
+
+
+def gradients(
+    params: Params,
+    slow_critic: Params,
+    return_range: Range,
+    batch: Observations,
+    noise: Mapping[str, Tensor],
+    spaces: Spaces,
+    config: Config,
+) -> tuple[dict[str, Tensor], Tensor, dict[str, Any]]:
+    """The gradient of the total by every parameter, zeros where there is none, with what `losses` returns. [AGT-28] [AGT-32] [OPT-18]"""
+    leaves = {name: x if x.requires_grad else x.detach().requires_grad_() for name, x in params.items()}
+    with torch.enable_grad():
+        total, aux = losses(leaves, slow_critic, return_range, batch, noise, spaces, config)
+        by_leaf: Iterable[Tensor] = torch.autograd.grad(total, list(leaves.values()), materialize_grads=True)
+    return dict(zip(leaves, by_leaf, strict=True)), total.detach(), aux
+
+
+def train_step(
+    state: State, batch: Observations, noise: Mapping[str, Tensor], spaces: Spaces, config: Config
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """One training step as a function: a new state and aux. `Learner` does the same in place. [AGT-29] [AGT-30] [AGT-31] [OPT-21] [BEH-21]"""
+    return_range = (state["return_range"]["low"], state["return_range"]["high"])
+    by_name, _, aux = gradients(state["params"], state["slow_critic"], return_range, batch, noise, spaces, config)
+    params, optimizer = optimizer_step(state["params"], by_name, state["optimizer"], config)
+    low, high = aux["return_range"]
+    new_state = {
+        "params": params,
+        "slow_critic": update_slow_critic(state["slow_critic"], params, config.slow_critic_decay),
+        "optimizer": optimizer,
+        "return_range": {"low": low, "high": high},
+    }
+    return new_state, aux

@@ -1,0 +1,120 @@
+"""Actor and critic: actions, log-probabilities, entropies, losses, the slow critic. Chapter: spec/08-behavior.md."""
+
+from collections.abc import Iterator, Mapping
+
+import torch
+from torch import Tensor
+
+from impl_torch.distributions import (
+    bounded_normal,
+    categorical_entropy,
+    categorical_log_prob,
+    categorical_sample,
+    normal_entropy,
+    normal_log_prob,
+    normal_sample,
+    symexp_twohot_mean,
+    twohot_cross_entropies,
+    unimix_log_probs,
+)
+from impl_torch.networks import Outputs
+from impl_torch.shapes import expect_keys, expect_last, expect_same_shape, expect_shape, widen
+from impl_torch.transforms import standard_bins
+from spec import Config, Spaces, Vector
+
+# One distribution of a policy: its parameters, how many entries it has in a flat action and how many in the noise.
+Part = tuple[tuple[Tensor, ...], int, int]
+
+
+def _parts(outputs: Outputs, spaces: Spaces, config: Config) -> Iterator[Part]:
+    """Per key in sorted order: mean and std [..., size] of a Vector, log-probabilities [..., classes] of each entry of a Discrete. [BEH-2] [BEH-4]"""
+    expect_keys("outputs", outputs, spaces.actions, exactly=True)
+    for key, space in spaces.actions.items():
+        for name, x in outputs[key].items():
+            expect_last(f"outputs[{key!r}][{name!r}]", x, space.encoded_size)
+        if isinstance(space, Vector):
+            raw = outputs[key]
+            yield bounded_normal(raw["mean"], raw["std"], config.actor_min_std, config.actor_max_std), space.size, space.size
+        else:
+            for logits in outputs[key]["logits"].split(space.classes, -1):
+                yield (unimix_log_probs(logits, config.actor_unimix),), logits.shape[-1], 1
+
+
+def _leading(outputs: Outputs) -> torch.Size:
+    return next(iter(next(iter(outputs.values())).values())).shape[:-1]
+
+
+@torch.no_grad()
+def sample_action(outputs: Outputs, noise: Tensor, spaces: Spaces, config: Config) -> Tensor:
+    """A flat action [..., A], constant, from noise [..., K]. [BEH-1] [BEH-3] [BEH-4] [BEH-5] [BEH-8] [BEH-22] [BEH-23]"""
+    parts = list(_parts(outputs, spaces, config))
+    expect_shape("noise", noise, (*_leading(outputs), spaces.action_noise_size))
+    actions = []
+    for (distribution, _, _), x in zip(parts, noise.split([taken for _, _, taken in parts], -1), strict=True):
+        categorical = len(distribution) == 1
+        actions.append(categorical_sample(distribution[0], x.squeeze(-1)) if categorical else normal_sample(*distribution, x))
+    return torch.cat(actions, -1)
+
+
+def action_log_prob(outputs: Outputs, action: Tensor, spaces: Spaces, config: Config) -> Tensor:
+    """Log-probability of a flat action [..., A], a constant, summed over everything: [...]. [BEH-5] [BEH-6] [BEH-22] [BEH-23]"""
+    parts = list(_parts(outputs, spaces, config))
+    expect_shape("action", action, (*_leading(outputs), spaces.action_size))
+    terms = []
+    for (distribution, _, _), x in zip(parts, action.detach().split([size for _, size, _ in parts], -1), strict=True):
+        categorical = len(distribution) == 1
+        terms.append(categorical_log_prob(distribution[0], x) if categorical else normal_log_prob(*distribution, x).sum(-1))
+    return torch.stack(terms).sum(0)
+
+
+def action_entropy(outputs: Outputs, spaces: Spaces, config: Config) -> Tensor:
+    """Entropy of the policy in nats, summed over everything: [...]. [BEH-7] [BEH-22] [BEH-23]"""
+    terms = []
+    for distribution, _, _ in _parts(outputs, spaces, config):
+        categorical = len(distribution) == 1
+        terms.append(categorical_entropy(distribution[0]) if categorical else normal_entropy(distribution[1]).sum(-1))
+    return torch.stack(terms).sum(0)
+
+
+def actor_loss(
+    log_prob: Tensor, entropy: Tensor, returns: Tensor, value: Tensor, weight: Tensor, scale: Tensor | float, config: Config
+) -> Tensor:
+    """-weight * (advantage * log_prob + entropy_scale * entropy): [N, H] five times -> [N, H]. [BEH-9] [BEH-10] [BEH-22] [BEH-23] [BEH-24]"""
+    expect_same_shape(log_prob=log_prob, entropy=entropy, returns=returns, value=value, weight=weight)
+    log_prob = widen(log_prob)
+    with torch.no_grad():
+        advantage = (returns - value) / scale
+    return -weight.detach() * (advantage * log_prob + config.entropy_scale * entropy)
+
+
+def critic_loss(logits: Tensor, slow_logits: Tensor, returns: Tensor, weight: Tensor, config: Config) -> Tensor:
+    """weight * (CE towards the return + slow_critic_scale * CE towards the slow mean): [N, H]. [BEH-12] [BEH-13] [BEH-22] [BEH-23] [BEH-24]"""
+    expect_same_shape(returns=returns, weight=weight)
+    return weight.detach() * _critic_cross_entropy(logits, slow_logits, returns, config)
+
+
+def replay_critic_loss(logits: Tensor, slow_logits: Tensor, returns: Tensor, is_last: Tensor, config: Config) -> Tensor:
+    """The same without weights and with the last steps of episodes masked: [B, T-1]. [BEH-14] [BEH-15] [BEH-22] [BEH-23] [BEH-24]"""
+    expect_same_shape(returns=returns, is_last=is_last)
+    loss = _critic_cross_entropy(logits, slow_logits, returns, config)
+    return (1 - is_last.to(loss.dtype)) * loss
+
+
+def _critic_cross_entropy(logits: Tensor, slow_logits: Tensor, returns: Tensor, config: Config) -> Tensor:
+    expect_shape("logits", logits, (*returns.shape, config.bins))
+    expect_same_shape(logits=logits, slow_logits=slow_logits)
+    logits = widen(logits)
+    bins = standard_bins(config.bins, logits.dtype, logits.device)
+    targets = torch.stack([returns.to(logits.dtype), symexp_twohot_mean(slow_logits.detach().to(logits.dtype), bins)], -1)
+    towards_return, towards_slow = twohot_cross_entropies(unimix_log_probs(logits, 0.0), targets, bins).unbind(-1)
+    return towards_return + config.slow_critic_scale * towards_slow
+
+
+@torch.no_grad()
+def update_slow_critic(slow: Mapping[str, Tensor], critic: Mapping[str, Tensor], decay: float) -> dict[str, Tensor]:
+    """decay * slow + (1 - decay) * critic, as a new mapping; critic may hold more than `critic/...`. [BEH-19] [BEH-20] [BEH-21]"""
+    live = {name: x for name, x in critic.items() if name.startswith("critic/")}
+    expect_keys("slow", slow, live, exactly=True)
+    for name, x in slow.items():
+        expect_shape(f"slow[{name!r}]", x, live[name].shape)
+    return {name: decay * x + (1 - decay) * live[name].to(x.dtype) for name, x in slow.items()}

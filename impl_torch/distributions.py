@@ -1,0 +1,149 @@
+"""Distributions: what the networks' outputs mean. Chapter: spec/02-distributions.md.
+
+Samples and targets are constants. Everything is computed in float32 or float64 ([DIS-1]).
+"""
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from impl_torch.shapes import expect_last, expect_same_shape, expect_shape, widen
+from impl_torch.transforms import Bins, ordered_expectation, symlog, twohot_sparse
+
+HALF_LOG_TWO_PI = 0.5 * math.log(2 * math.pi)
+
+
+def _constant(x: Tensor, like: Tensor) -> Tensor:
+    return x.detach().to(like.dtype)
+
+
+def unimix_log_probs(logits: Tensor, unimix: float) -> Tensor:
+    """ln((1 - unimix) softmax(logits) + unimix / C) over the last axis, [..., C] -> [..., C]. [DIS-5] [DIS-6] [DIS-7]"""
+    logits = widen(logits)
+    if unimix == 0:
+        return F.log_softmax(logits, -1)
+    return torch.log((1 - unimix) * torch.softmax(logits, -1) + unimix / logits.shape[-1])
+
+
+def categorical_sample(log_probs: Tensor, uniform: Tensor) -> Tensor:
+    """One-hot sample by inverse CDF, constant: [..., C] and [...] -> [..., C]. [DIS-2] [DIS-3] [DIS-8] [CON-17]"""
+    expect_shape("uniform", uniform, log_probs.shape[:-1])
+    return sample_onehot(widen(log_probs.detach()).exp(), uniform)
+
+
+def sample_onehot(probs: Tensor, uniform: Tensor) -> Tensor:
+    """`categorical_sample` from probabilities."""
+    below = torch.cumsum(probs[..., :-1], -1) <= uniform.to(probs.dtype).unsqueeze(-1)
+    return torch.zeros_like(probs).scatter_(-1, below.sum(-1, keepdim=True), 1.0)
+
+
+def straight_through(log_probs: Tensor, sample: Tensor) -> Tensor:
+    """The sample, with the gradient of the probabilities: [..., C] twice -> [..., C]. [DIS-9]"""
+    expect_same_shape(log_probs=log_probs, sample=sample)
+    probs = widen(log_probs).exp()
+    return _constant(sample, probs) + (probs - probs.detach())
+
+
+def categorical_log_prob(log_probs: Tensor, onehot: Tensor) -> Tensor:
+    """Log-probability of the chosen class, 0 for an all-zero onehot: [..., C] twice -> [...]. [DIS-4] [DIS-10] [DIS-13]"""
+    expect_same_shape(log_probs=log_probs, onehot=onehot)
+    log_probs = widen(log_probs)
+    onehot = _constant(onehot, log_probs)
+    return (onehot * log_probs.masked_fill(onehot == 0, 0)).sum(-1)
+
+
+def categorical_entropy(log_probs: Tensor) -> Tensor:
+    """-sum p ln p, in nats: [..., C] -> [...]. [DIS-4] [DIS-11] [DIS-13]"""
+    log_probs = widen(log_probs)
+    probs = log_probs.exp()
+    return -(probs * log_probs.masked_fill(probs == 0, 0)).sum(-1)
+
+
+def categorical_kl(log_probs_p: Tensor, log_probs_q: Tensor) -> Tensor:
+    """sum p (ln p - ln q) over the last axis, in nats: [..., C] twice -> [...]. [DIS-4] [DIS-12] [DIS-13]"""
+    expect_same_shape(log_probs_p=log_probs_p, log_probs_q=log_probs_q)
+    log_probs_p = widen(log_probs_p)
+    probs = log_probs_p.exp()
+    impossible = probs == 0
+    difference = log_probs_p.masked_fill(impossible, 0) - log_probs_q.to(probs.dtype).masked_fill(impossible, 0)
+    return (probs * difference).sum(-1)
+
+
+def symexp_twohot_loss(logits: Tensor, target: Tensor, bins: Bins) -> Tensor:
+    """Cross entropy towards the twohot of a scalar target: [..., K], [...] and [K] -> [...]. [DIS-14] [DIS-4]"""
+    expect_last("logits", logits, len(bins))
+    expect_shape("target", target, logits.shape[:-1])
+    return twohot_cross_entropies(F.log_softmax(widen(logits), -1), target.unsqueeze(-1), bins).squeeze(-1)
+
+
+def twohot_cross_entropies(log_probs: Tensor, targets: Tensor, bins: Bins) -> Tensor:
+    """The same for n targets of each distribution: log-softmax [..., K], targets [..., n] -> [..., n].
+
+    Only the two bins that have weight are read, and both losses of the critic share one log-softmax.
+    """
+    indices, weights = twohot_sparse(targets.to(log_probs.dtype), bins)
+    picked = log_probs.gather(-1, indices.flatten(-2)).view_as(weights)
+    return -(weights * picked.masked_fill(weights == 0, 0)).sum(-1)
+
+
+def symexp_twohot_mean(logits: Tensor, bins: Bins) -> Tensor:
+    """Mean of the softmax over the bins, exactly 0 for equal logits: [..., K] and [K] -> [...]. [DIS-15]"""
+    return ordered_expectation(torch.softmax(widen(logits), -1), bins)
+
+
+def bernoulli_loss(logit: Tensor, target: Tensor) -> Tensor:
+    """Binary cross entropy with a target in [0, 1], element by element. [DIS-4] [DIS-16] [DIS-17]"""
+    expect_same_shape(logit=logit, target=target)
+    logit = widen(logit)
+    target = _constant(target, logit)
+    success = F.logsigmoid(logit).masked_fill(target == 0, 0)
+    failure = F.logsigmoid(-logit).masked_fill(target == 1, 0)
+    return -(target * success + (1 - target) * failure)
+
+
+def bernoulli_mean(logit: Tensor) -> Tensor:
+    """The probability sigmoid(logit), element by element. [DIS-18]"""
+    return torch.sigmoid(widen(logit))
+
+
+def bounded_normal(mean: Tensor, std: Tensor, min_std: float, max_std: float) -> tuple[Tensor, Tensor]:
+    """Mean in [-1, 1] and standard deviation in [min_std, max_std] from two raw outputs [...] each. [DIS-19]"""
+    expect_same_shape(mean=mean, std=std)
+    mean = widen(mean)
+    return torch.tanh(mean), (max_std - min_std) * torch.sigmoid(std.to(mean.dtype) + 2) + min_std
+
+
+def normal_sample(mean: Tensor, std: Tensor, normal: Tensor) -> Tensor:
+    """mean + std * normal, constant, element by element. [DIS-20] [CON-18]"""
+    expect_same_shape(mean=mean, std=std, normal=normal)
+    mean = widen(mean)
+    return (mean + std.to(mean.dtype) * normal.to(mean.dtype)).detach()
+
+
+def normal_log_prob(mean: Tensor, std: Tensor, value: Tensor) -> Tensor:
+    """Log-density of each element, in nats, with no gradient into the value. [DIS-21]"""
+    expect_same_shape(mean=mean, std=std, value=value)
+    mean = widen(mean)
+    std = std.to(mean.dtype)
+    return -0.5 * torch.square((_constant(value, mean) - mean) / std) - std.log() - HALF_LOG_TWO_PI
+
+
+def normal_entropy(std: Tensor) -> Tensor:
+    """1/2 + 1/2 ln(2 pi) + ln std of each element, in nats. [DIS-22]"""
+    return 0.5 + HALF_LOG_TWO_PI + widen(std).log()
+
+
+def mse_loss(prediction: Tensor, target: Tensor) -> Tensor:
+    """Square of the difference, element by element. [DIS-23]"""
+    expect_same_shape(prediction=prediction, target=target)
+    prediction = widen(prediction)
+    return torch.square(prediction - _constant(target, prediction))
+
+
+def symlog_mse_loss(prediction: Tensor, target: Tensor, scale: float) -> Tensor:
+    """scale * (prediction - symlog(target))^2, element by element; the prediction is in symlog space. [DIS-24]"""
+    expect_same_shape(prediction=prediction, target=target)
+    prediction = widen(prediction)
+    return scale * torch.square(prediction - symlog(_constant(target, prediction)))

@@ -1,0 +1,205 @@
+"""Layers: the parts that networks are built from. Chapter: spec/03-layers.md.
+
+Images are [..., H, W, C]. For PyTorch that is a "channels last" tensor seen through a permutation, so nothing is copied.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from impl_torch.shapes import expect, expect_last, expect_shape, widen
+
+Params = Mapping[str, Tensor]
+
+TRUNCATED_STD = 0.8796256610342398  # of the standard normal cut at +-2
+# From this many rows on, a float32 product on the CPU is computed as a 1x1 convolution. PyTorch gives matrix products to MKL, which on AMD
+# processors does not use AVX-512, and convolutions to oneDNN, which does: about 1.8 times faster on a Zen 5, and no slower elsewhere.
+# Below it, oneDNN's rearrangement of the kernel costs more than it wins. A single thread never reaches oneDNN, and loses nothing.
+CONVOLUTION_ROWS = 256
+
+
+def _as_convolution(x: Tensor, rows: int) -> bool:
+    return rows >= CONVOLUTION_ROWS and x.device.type == "cpu" and x.dtype == torch.float32 and torch.backends.mkldnn.is_available()
+
+
+def _pointwise(x: Tensor, weight: Tensor, bias: Tensor | None, groups: int) -> Tensor:
+    """The rows of x [N, in] as the pixels of one channels-last image; weight [out, in/groups]."""
+    rows, inputs = x.shape
+    width = 32 if rows % 32 == 0 else 1
+    image = x.reshape(1, rows // width, width, inputs).permute(0, 3, 1, 2)
+    y = F.conv2d(image, weight[:, :, None, None], bias, groups=groups)
+    return y.permute(0, 2, 3, 1).reshape(rows, -1)
+
+
+def linear(x: Tensor, kernel: Tensor, bias: Tensor | None) -> Tensor:
+    """x @ kernel + bias over the last axis: [..., in], [in, out], [out] -> [..., out]. [LAY-1] [LAY-2] [LAY-15]"""
+    expect(kernel.ndim == 2, "kernel", "shape [in, out]", list(kernel.shape))
+    expect_last("x", x, kernel.shape[0])
+    kernel = kernel.to(x.dtype)
+    if bias is not None:
+        expect_shape("bias", bias, kernel.shape[1:])
+        bias = bias.to(x.dtype)
+    rows = x.reshape(-1, x.shape[-1])
+    if _as_convolution(x, len(rows)):
+        y = _pointwise(rows, kernel.t(), bias, 1)
+    else:
+        y = rows @ kernel if bias is None else torch.addmm(bias, rows, kernel)
+    return y.view(*x.shape[:-1], kernel.shape[1])
+
+
+def block_linear(x: Tensor, kernel: Tensor, bias: Tensor | None) -> Tensor:
+    """A linear layer of G contiguous blocks: [..., in], [G, in/G, out/G], [out] -> [..., out]. [LAY-1] [LAY-3] [LAY-15]"""
+    expect(kernel.ndim == 3, "kernel", "shape [G, in/G, out/G]", list(kernel.shape))
+    blocks, inputs, outputs = kernel.shape
+    expect_last("x", x, blocks * inputs)
+    kernel = kernel.to(x.dtype)
+    if bias is not None:
+        expect_shape("bias", bias, (blocks * outputs,))
+        bias = bias.to(x.dtype)
+    rows = x.reshape(-1, blocks * inputs)
+    if _as_convolution(x, len(rows)):
+        y = _pointwise(rows, kernel.transpose(1, 2).reshape(blocks * outputs, inputs), bias, blocks)
+    else:
+        y = torch.bmm(rows.view(-1, blocks, inputs).transpose(0, 1), kernel).transpose(0, 1).reshape(-1, blocks * outputs)
+        y = y if bias is None else y + bias
+    return y.view(*x.shape[:-1], blocks * outputs)
+
+
+def normalize(x: Tensor, epsilon: float) -> tuple[Tensor, Tensor]:
+    """x / root mean square over the last axis, and 1 / root mean square [..., 1], both in float32 or better."""
+    x = widen(x)
+    norm = torch.linalg.vector_norm(x, dim=-1, keepdim=True)  # one pass, unlike the mean of the square
+    inverse = torch.rsqrt(norm * norm / x.shape[-1] + epsilon)
+    return x * inverse, inverse
+
+
+def rms_norm(x: Tensor, scale: Tensor, epsilon: float) -> Tensor:
+    """x / sqrt(mean(x^2) + epsilon) * scale over the last axis: [..., n] and [n] -> [..., n]. [LAY-1] [LAY-4] [LAY-15]"""
+    expect_shape("scale", scale, x.shape[-1:])
+    normal, _ = normalize(x, epsilon)
+    return (normal * scale.to(x.dtype)).to(x.dtype)
+
+
+def silu(x: Tensor) -> Tensor:
+    """x sigmoid(x), element by element. [LAY-5]"""
+    return F.silu(x)
+
+
+def norm_silu(x: Tensor, scale: Tensor, epsilon: float) -> Tensor:
+    """silu(rms_norm(x, scale, epsilon)), fused. scale may have more axes than one: [..., k, n] and [k, n]."""
+    return _NormSilu.apply(x, scale, epsilon)
+
+
+def norm_silu_forward(x: Tensor, scale: Tensor, epsilon: float) -> Tensor:
+    """The value of `norm_silu`, outside of autograd."""
+    normal, _ = normalize(x, epsilon)
+    return F.silu(normal.mul_(scale.to(x.dtype)).to(x.dtype), inplace=True)
+
+
+def silu_slope(x: Tensor) -> Tensor:
+    """The derivative of silu: s + x s (1 - s) with s = sigmoid(x)."""
+    gate = torch.sigmoid(x)
+    return torch.addcmul(gate, x * gate, 1 - gate)
+
+
+def norm_gradients(gradient: Tensor, normal: Tensor, inverse: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
+    """From the gradient by scale * normal, with `normal, inverse = normalize(x)`: the gradients by x and by scale."""
+    by_scale = (gradient * normal).sum(tuple(range(gradient.ndim - scale.ndim)))
+    scaled = gradient * scale
+    along = (scaled * normal).mean(-1, keepdim=True)
+    return torch.addcmul(scaled, normal, along, value=-1).mul_(inverse), by_scale
+
+
+class _NormSilu(torch.autograd.Function):
+    """Keeps nothing but its input and recomputes the rest, where autograd would keep, and read again, every intermediate result."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, scale: Tensor, epsilon: float) -> Tensor:
+        ctx.save_for_backward(x, scale)
+        ctx.epsilon = epsilon
+        return norm_silu_forward(x, scale, epsilon)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, None]:  # type: ignore[override]
+        x, scale = ctx.saved_tensors
+        normal, inverse = normalize(x, ctx.epsilon)
+        wide = scale.to(x.dtype).to(normal.dtype)
+        by_x, by_scale = norm_gradients(silu_slope(normal * wide).mul_(gradient), normal, inverse, wide)
+        return by_x.to(x.dtype), by_scale.to(scale.dtype), None
+
+
+def _check_convolution(x: Tensor, kernel: Tensor, bias: Tensor) -> None:
+    expect(x.ndim >= 3, "x", "shape [..., H, W, in]", list(x.shape))
+    expect(kernel.ndim == 4 and tuple(kernel.shape[:2]) == (5, 5), "kernel", "shape [5, 5, in, out]", list(kernel.shape))
+    expect_last("x", x, kernel.shape[2])
+    expect_shape("bias", bias, kernel.shape[3:])
+
+
+def _to_planes(x: Tensor) -> Tensor:
+    """[..., H, W, C] -> [N, C, H, W], the same memory."""
+    return x.reshape(-1, *x.shape[-3:]).permute(0, 3, 1, 2)
+
+
+def _to_pixels(y: Tensor, x: Tensor) -> Tensor:
+    """[N, C, H, W] -> [..., H, W, C] with the leading axes of x."""
+    y = y.permute(0, 2, 3, 1)
+    return y.reshape(*x.shape[:-3], *y.shape[1:])
+
+
+def convolution(x: Tensor, kernel: Tensor, bias: Tensor, stride: int) -> Tensor:
+    """5x5 cross-correlation: [..., H, W, in], [5, 5, in, out], [out] -> [..., H/stride, W/stride, out]. [LAY-1] [LAY-6] [LAY-15]"""
+    _check_convolution(x, kernel, bias)
+    expect(stride in (1, 2), "stride", "1 or 2", stride)
+    expect(stride == 1 or not (x.shape[-3] % 2 or x.shape[-2] % 2), "x", "even sides at stride 2", list(x.shape))
+    planes = _to_planes(x)
+    if stride == 2:
+        planes = F.pad(planes, (1, 2, 1, 2))
+    y = F.conv2d(planes, kernel.to(x.dtype).permute(3, 2, 0, 1), bias.to(x.dtype), stride, padding=2 if stride == 1 else 0)
+    return _to_pixels(y, x)
+
+
+def transposed_convolution(x: Tensor, kernel: Tensor, bias: Tensor) -> Tensor:
+    """The adjoint of the stride-2 convolution: [..., H, W, in], [5, 5, in, out], [out] -> [..., 2H, 2W, out]. [LAY-1] [LAY-7] [LAY-15]"""
+    _check_convolution(x, kernel, bias)
+    y = F.conv_transpose2d(_to_planes(x), kernel.to(x.dtype).permute(2, 3, 0, 1), bias.to(x.dtype), stride=2, padding=1)
+    return _to_pixels(y[:, :, :-1, :-1], x)  # PyTorch pads on both sides alike, so one row and one column come out too many
+
+
+def max_pool(x: Tensor) -> Tensor:
+    """Largest value of each 2x2 square: [..., H, W, C] -> [..., H/2, W/2, C]. [LAY-12] [LAY-15]"""
+    expect(x.ndim >= 3, "x", "shape [..., H, W, C]", list(x.shape))
+    expect(not (x.shape[-3] % 2 or x.shape[-2] % 2), "x", "even sides", list(x.shape))
+    return _to_pixels(F.max_pool2d(_to_planes(x), 2), x)
+
+
+def upsample(x: Tensor) -> Tensor:
+    """Every pixel twice in both directions: [..., H, W, C] -> [..., 2H, 2W, C]. [LAY-13] [LAY-15]"""
+    expect(x.ndim >= 3, "x", "shape [..., H, W, C]", list(x.shape))
+    return _to_pixels(F.interpolate(_to_planes(x), scale_factor=2, mode="nearest"), x)
+
+
+def dense(params: Params, name: str, x: Tensor, epsilon: float) -> Tensor:
+    """Linear, RMSNorm, SiLU with the parameters name/kernel, name/bias, name/scale: [..., in] -> [..., out]. [LAY-8]"""
+    y = linear(x, params[f"{name}/kernel"], params[f"{name}/bias"])
+    scale = params[f"{name}/scale"]
+    expect_shape(f"{name}/scale", scale, y.shape[-1:])
+    return norm_silu(y, scale, epsilon)
+
+
+def mlp(params: Params, name: str, x: Tensor, layers: int, epsilon: float) -> Tensor:
+    """`layers` dense layers name/hidden0, name/hidden1, ...: [..., in] -> [..., out]. [LAY-8] [LAY-15]"""
+    expect(layers >= 1, "layers", "at least 1", layers)
+    for layer in range(layers):
+        x = dense(params, f"{name}/hidden{layer}", x, epsilon)
+    return x
+
+
+def truncated_normal(uniform: Tensor, fan_in: int, outscale: float) -> Tensor:
+    """Initial weights from uniforms, any shape: standard deviation outscale / sqrt(fan_in). [LAY-9] [LAY-10] [LAY-11]"""
+    expect(fan_in >= 1, "fan_in", "at least 1", fan_in)
+    normal = math.sqrt(2) * torch.erfinv((2 * uniform - 1) * math.erf(math.sqrt(2)))
+    return normal.clamp(-2, 2) * (outscale / math.sqrt(fan_in) / TRUNCATED_STD)

@@ -1,0 +1,230 @@
+"""What training talks to: one agent, its optimizer and its random numbers on one device. Interface: train/backend.py."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from impl_torch.agent import gradients, initial_parameters, policy_step
+from impl_torch.optimizer import flat_optimizer, flat_step_
+from impl_torch.parameters import Layout, Parameters
+from impl_torch.rssm import prepare
+from impl_torch.shapes import compute_dtype, wide_dtype
+from spec import Config, Discrete, Spaces, parameter_table
+
+Arrays = Mapping[str, np.ndarray]
+INITIALIZATION, POLICY, TRAIN = range(3)  # independent streams of random numbers
+
+
+class Learner:
+    """One agent.
+
+    All of its state lies in a few flat buffers that a train step changes in place. Random numbers are a function of the seed, of what they
+    are for and of a counter, so that a resumed run goes on as an uninterrupted one would have.
+
+    Raises:
+      ValueError: a device that is unknown or not there.
+    """
+
+    def __init__(self, spaces: Spaces, config: Config, *, seed: int, device: str | None = None) -> None:
+        self.spaces, self.config, self.seed = spaces, config, seed
+        self._device = select_device(device)
+        self.device = str(self._device)
+        if self._device.type == "cuda":
+            # [LAY-1]: TensorFloat-32 is not float32. Convolutions would use it unasked.
+            torch.set_float32_matmul_precision("highest")
+            torch.backends.cudnn.allow_tf32 = False
+        self._dtype = wide_dtype(config)
+        table = parameter_table(config, spaces)
+        kernels = {name: entry.shape for name, entry in table.items() if entry.initializer == "truncated_normal"}
+        generator = self._generator(INITIALIZATION, 0)
+        self.parameters = Parameters(initial_parameters(table, {name: self._uniform(generator, *shape) for name, shape in kernels.items()}))
+        self._flat, self._layout = self.parameters.flat, self.parameters.layout
+        self._critic_layout = Layout({name: entry.shape for name, entry in table.items() if name.startswith("critic/")})
+        self._critic_flat = self._flat[-self._critic_layout.total :]  # the critic is the last of the table
+        self._slow_flat = self._critic_flat.clone()
+        self._slow_critic = self._critic_layout.views(self._slow_flat)
+        self._second_moment, self._momentum = torch.zeros_like(self._flat), torch.zeros_like(self._flat)
+        self._set_step(0)
+        self._low, self._high = torch.zeros((2,), dtype=self._dtype, device=self._device).unbind()
+        self._policy_calls = self._train_steps = 0
+        self._acting: Mapping[str, Tensor] | None = None  # the parameters as the policy uses them, until the next train step
+
+    def initial_carry(self, envs: int) -> dict[str, Tensor]:
+        """All zeros: {"deter" [N, D], "stoch" [N, S, C], "action" [N, A]}. [CON-5]"""
+        c = self.config
+        shapes = {"deter": (c.deter,), "stoch": (c.stoch, c.classes), "action": (self.spaces.action_size,)}
+        return {name: torch.zeros(envs, *shape, dtype=compute_dtype(c), device=self._device) for name, shape in shapes.items()}
+
+    @torch.no_grad()
+    def policy(self, observation: Arrays, is_first: np.ndarray, carry: Mapping[str, Tensor]) -> tuple[np.ndarray, Arrays, dict[str, Tensor]]:
+        """One acting step: observation {key: [N, ...]}, is_first [N] -> (action [N, A], latents, carry). [AGT-11]"""
+        generator = self._generator(POLICY, self._policy_calls)
+        self._policy_calls += 1
+        noise = {
+            "posterior": self._uniform(generator, len(is_first), self.config.stoch),
+            "action": self._action_noise(generator, len(is_first)),
+        }
+        if self._acting is None:
+            self._acting = prepare({name: x.detach() for name, x in self.parameters.mapping().items()}, self.config)
+        inputs = {key: self._to_device(observation[key]) for key in self.spaces.observations}
+        state, action = policy_step(self._acting, carry, carry["action"], inputs, self._to_device(is_first), noise, self.spaces, self.config)
+        latents = {"deter": state["deter"].float().cpu().numpy(), "stoch": state["stoch"].argmax(-1).cpu().numpy()}
+        return action.float().cpu().numpy(), latents, state | {"action": action}
+
+    def train_step(self, batch: Arrays) -> tuple[dict[str, Any], dict[str, Any]]:
+        """One gradient step on a replay batch: scalar metrics by name, and the latents to write back. [AGT-29] [AGT-30]"""
+        config = self.config
+        inputs = {name: self._to_device(x) for name, x in batch.items()}
+        params = self.parameters.mapping()
+        by_name, total, aux = gradients(params, self._slow_critic, (self._low, self._high), inputs, self._train_noise(inputs), self.spaces, config)
+        with torch.no_grad():
+            norms, factors = flat_step_(self._optimizer, self._flat, self._layout.pack(by_name.values()), self._layout, config)
+            self._slow_flat.lerp_(self._critic_flat, 1 - config.slow_critic_decay)
+            self._low, self._high = aux["return_range"]
+            self._train_steps += 1
+            self._acting = None
+            group = self._optimizer.param_groups[0]
+            update = torch.linalg.vector_norm(self._momentum) * (group["lr"] / (1 - config.beta1**self._step))
+            metrics = {
+                "loss/total": total,
+                **{f"loss/{name}": value for name, value in aux["losses"].items()},
+                **aux["metrics"],
+                "return_low": self._low,
+                "return_high": self._high,
+                "gradient_norm": torch.linalg.vector_norm(norms),
+                "update_norm": update,
+                "clip_fraction": (factors < 1).double().mean(),
+            }
+            values = _to_host(torch.stack([value.double() for value in metrics.values()]))
+            latents = {"deter": _to_host(aux["deter"].float()), "stoch": _to_host(aux["stoch"].argmax(-1))}
+        return {name: _Element(values, index) for index, name in enumerate(metrics)}, latents
+
+    def state_dict(self) -> dict[str, np.ndarray]:
+        """The training state under its canonical names, as copies. [AGT-8] [AGT-9]"""
+        state = {name: x.detach().cpu().numpy().copy() for name, x in self._tensors().items()}
+        counters = {"optimizer/step": self._step, "counters/policy": self._policy_calls, "counters/train": self._train_steps}
+        return state | {name: np.asarray(value, np.int64) for name, value in counters.items()}
+
+    @torch.no_grad()
+    def load_state_dict(self, state: Arrays) -> None:
+        """The inverse of `state_dict`. [AGT-10]
+
+        Raises:
+          ValueError: a missing or unexpected name, or a wrong shape; nothing is changed then.
+        """
+        tensors = self._tensors()
+        shapes = {name: tuple(x.shape) for name, x in tensors.items()} | dict.fromkeys(("optimizer/step", "counters/policy", "counters/train"), ())
+        problems = [f"missing {name}" for name in sorted(set(shapes) - set(state))]
+        problems += [f"unexpected {name}" for name in sorted(set(state) - set(shapes))]
+        for name in sorted(set(shapes).intersection(state)):
+            if np.shape(state[name]) != shapes[name]:
+                problems.append(f"{name}: expected shape {list(shapes[name])}, got {list(np.shape(state[name]))}")
+        if problems:
+            raise ValueError("the training state does not fit this configuration and these spaces: " + "; ".join(problems))
+        for flat in (self._flat, self._second_moment, self._momentum, self._slow_flat):
+            flat.zero_()  # the gaps between the tensors too
+        for name, x in tensors.items():
+            x.copy_(torch.tensor(np.asarray(state[name])))
+        self._set_step(int(state["optimizer/step"]))
+        self._policy_calls, self._train_steps = int(state["counters/policy"]), int(state["counters/train"])
+        self._acting = None
+
+    def _tensors(self) -> dict[str, Tensor]:
+        """Everything in the training state but whole numbers, under canonical names; writing to a tensor changes the state."""
+        trees = {
+            "params/": self._layout.views(self._flat),
+            "slow_critic/": self._slow_critic,
+            "optimizer/second_moment/": self._layout.views(self._second_moment),
+            "optimizer/momentum/": self._layout.views(self._momentum),
+            "return_range/": {"low": self._low, "high": self._high},
+        }
+        return {prefix + name: x for prefix, tree in trees.items() for name, x in tree.items()}
+
+    @property
+    def _step(self) -> int:
+        return self._optimizer.state[self._flat]["step"]
+
+    def _set_step(self, step: int) -> None:
+        self._optimizer = flat_optimizer(self._flat, self._second_moment, self._momentum, step, self.config)
+
+    def _to_device(self, x: np.ndarray) -> Tensor:
+        tensor = torch.as_tensor(np.ascontiguousarray(x))
+        if self._device.type == "cuda":
+            return tensor.pin_memory().to(self._device, non_blocking=True)
+        return tensor
+
+    def _generator(self, stream: int, counter: int) -> torch.Generator:
+        """Fresh random numbers for one call. [CON-21]"""
+        seed = np.random.SeedSequence([self.seed, stream, counter]).generate_state(1, np.uint64)
+        return torch.Generator(self._device).manual_seed(int(seed[0]))
+
+    def _uniform(self, generator: torch.Generator, *shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator, dtype=self._dtype, device=self._device)
+
+    def _action_noise(self, generator: torch.Generator, *leading: int) -> Tensor:
+        """[..., K]: normals for a Vector, uniforms for a Discrete. [CON-19]"""
+        parts = []
+        for space in self.spaces.actions.values():
+            draw = torch.rand if isinstance(space, Discrete) else torch.randn
+            parts.append(draw(*leading, *space.array_shape, generator=generator, dtype=self._dtype, device=self._device))
+        return torch.cat(parts, -1)
+
+    def _train_noise(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """[CON-20]"""
+        generator = self._generator(TRAIN, self._train_steps)
+        (B, T), H, S = batch["reward"].shape, self.config.imagination_horizon, self.config.stoch
+        return {
+            "posterior": self._uniform(generator, B, T, S),
+            "prior": self._uniform(generator, B * T, H, S),
+            "action": self._action_noise(generator, B * T, H),
+        }
+
+
+def select_device(device: str | None) -> torch.device:
+    """The device of that name: "cpu", "gpu" or "cuda", "cuda:1", ...; None takes a GPU if there is one.
+
+    Raises:
+      ValueError: an unknown device, or a GPU that PyTorch cannot use.
+    """
+    if device is None:
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    kind, _, index = device.replace("gpu", "cuda").partition(":")
+    if kind not in ("cpu", "cuda") or (index and not index.isdigit()):
+        raise ValueError(f"unknown device {device!r}; expected cpu, gpu, cuda or cuda:<number>")
+    if kind == "cuda" and int(index or 0) >= torch.cuda.device_count():
+        build = "a build for CPUs only" if torch.version.cuda is None and torch.version.hip is None else f"{torch.cuda.device_count()} GPUs"
+        raise ValueError(f"device {device!r} is not there: PyTorch {torch.__version__} has {build}; use --device cpu or install a build for GPUs")
+    return torch.device(kind, int(index)) if index else torch.device(kind)
+
+
+class _Copying:
+    """An array on its way from the accelerator; `np.asarray` waits for it."""
+
+    def __init__(self, x: Tensor) -> None:
+        self._host = torch.empty(x.shape, dtype=x.dtype, pin_memory=True).copy_(x, non_blocking=True)
+        self._done = torch.cuda.Event()
+        self._done.record()
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        self._done.synchronize()
+        return np.array(self._host.numpy(), dtype=dtype, copy=copy)
+
+
+class _Element:
+    """One number of an array that may still be on its way."""
+
+    def __init__(self, array: Any, index: int) -> None:
+        self._array, self._index = array, index
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        return np.asarray(self._array, dtype)[self._index]
+
+    def __float__(self) -> float:
+        return float(np.asarray(self._array)[self._index])
+
+
+def _to_host(x: Tensor) -> Any:
+    return _Copying(x) if x.device.type == "cuda" else x.numpy()

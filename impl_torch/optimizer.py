@@ -1,0 +1,194 @@
+"""AGC and LaProp. Chapter: spec/09-optimizer.md.
+
+`LaProp` is an ordinary `torch.optim.Optimizer`, and `clip_gradients_` works before any optimizer as `torch.nn.utils.clip_grad_norm_` does;
+both can be used alone. The functions of the chapter's names return new tensors.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from impl_torch.parameters import ROW, Layout
+from impl_torch.shapes import expect, expect_keys, expect_same_shape, expect_shape, wide_dtype
+from spec import Config
+
+DEAD_ZONE = 1e-16  # [OPT-9]
+# Numbers that the CPU updates at a time: the whole chain of operations on them runs in the cache, not once through memory for each.
+CHUNK = 1 << 17
+
+
+def _norm(x: Tensor) -> Tensor:
+    """Root of the sum of squares, without overflow of the squares. [OPT-3]"""
+    peak = torch.linalg.vector_norm(x, math.inf)
+    safe = torch.where(peak == 0, 1, peak)
+    return peak * torch.linalg.vector_norm(x / safe)
+
+
+def _clip_factor(gradient_norm: Tensor, parameter_norm: Tensor, clip: float, epsilon: float) -> Tensor:
+    """What a clipped gradient is multiplied by; NaN where a norm is not finite. [OPT-1] [OPT-4] [OPT-5]"""
+    threshold = clip * parameter_norm.clamp(min=epsilon)
+    factor = torch.where(gradient_norm > threshold, threshold / gradient_norm, 1.0)
+    return torch.where(gradient_norm.isfinite() & parameter_norm.isfinite(), factor, math.nan)
+
+
+@torch.no_grad()
+def adaptive_gradient_clip(gradient: Tensor, parameter: Tensor, clip: float, epsilon: float) -> Tensor:
+    """The gradient, no longer than clip * max(epsilon, norm(parameter)); any shape. [OPT-1] to [OPT-5]"""
+    expect_same_shape(parameter=parameter, gradient=gradient)
+    return gradient * _clip_factor(_norm(gradient), _norm(parameter), clip, epsilon)
+
+
+@torch.no_grad()
+def clip_gradients_(parameters: Iterable[Tensor], clip: float, epsilon: float = 1e-3) -> None:
+    """Adaptive gradient clipping of each parameter's `.grad`, in place."""
+    for parameter in parameters:
+        if parameter.grad is not None:
+            parameter.grad.copy_(adaptive_gradient_clip(parameter.grad, parameter, clip, epsilon))
+
+
+@torch.no_grad()
+def clip_flat_gradients_(gradients: Tensor, parameters: Tensor, layout: Layout, clip: float, epsilon: float) -> tuple[Tensor, Tensor]:
+    """The same for all tensors of a flat buffer at once, in place. [OPT-2]
+
+    gradients, parameters [total]. Returns the norm of each tensor's gradient before clipping [P] and the factors [P].
+    """
+    counts, owner = layout.row_counts(gradients.device)
+    norms = [_segment_norms(x.view(-1, ROW), counts, owner) for x in (gradients, parameters)]
+    factors = _clip_factor(*norms, clip, epsilon)
+    gradients.view(-1, ROW).mul_(factors.to(gradients.dtype)[owner].unsqueeze(-1))
+    return norms[0], factors
+
+
+def _segment_norms(rows: Tensor, counts: Tensor, owner: Tensor) -> Tensor:
+    """Norm of each tensor [P], float64, from its rows [R, ROW]. [OPT-3]"""
+    if rows.dtype == torch.float64:
+        peaks = torch.linalg.vector_norm(rows, math.inf, dim=1)
+        norms = peaks * torch.linalg.vector_norm(rows / torch.where(peaks == 0, 1, peaks).unsqueeze(-1), dim=1)
+    else:
+        norms = torch.linalg.vector_norm(rows, dim=1, dtype=torch.float64)  # the square of no float32 overflows in float64
+    peaks = torch.segment_reduce(norms, "max", lengths=counts, unsafe=True)
+    safe = torch.where(peaks == 0, 1, peaks)
+    return peaks * torch.segment_reduce(torch.square(norms / safe[owner]), "sum", lengths=counts, unsafe=True).sqrt()
+
+
+def learning_rate(step: int, config: Config) -> float:
+    """After `step` updates: the constant rate, or a linear rise to it over warmup_steps from exactly 0. [OPT-6]"""
+    if config.warmup_steps == 0:
+        return config.learning_rate
+    return config.learning_rate * min(1.0, step / config.warmup_steps)
+
+
+def _correction(beta: float, step: int) -> float:
+    """1 - beta^t for t = step + 1, in float64. [OPT-11] [OPT-14]"""
+    expect(0 <= beta < 1, "beta", "at least 0 and below 1", beta)
+    return -math.expm1((step + 1) * math.log(beta)) if beta else 1.0
+
+
+def _laprop_(
+    gradient: Tensor, second_moment: Tensor, momentum: Tensor, step: int, beta1: float, beta2: float, epsilon: float, out: Tensor, rate: float
+) -> None:
+    """Updates both moments in place and subtracts rate * update from `out`; all of one shape. [OPT-8] to [OPT-12]"""
+    first, second = _correction(beta1, step), _correction(beta2, step)
+    gradient = gradient.masked_fill(gradient.abs() < DEAD_ZONE, 0)
+    second_moment.mul_(beta2).addcmul_(gradient, gradient, value=1 - beta2)
+    size = torch.div(second_moment, second).sqrt_().add_(epsilon)
+    # Where the gradient is 0 its share is 0, not 0/0: [OPT-10].
+    momentum.mul_(beta1).add_(torch.div(gradient, size, out=size).masked_fill_(gradient == 0, 0), alpha=1 - beta1)
+    out.add_(momentum, alpha=-rate / first)
+
+
+@torch.no_grad()
+def laprop(gradient: Tensor, second_moment: Tensor, momentum: Tensor, step: int, config: Config) -> tuple[Tensor, Tensor, Tensor]:
+    """(update, new second moment, new momentum), without learning rate and sign; any shape. [OPT-8] to [OPT-14]"""
+    expect_same_shape(gradient=gradient, second_moment=second_moment, momentum=momentum)
+    second_moment, momentum, update = second_moment.clone(), momentum.clone(), torch.zeros_like(momentum)
+    _laprop_(gradient, second_moment, momentum, step, config.beta1, config.beta2, config.laprop_epsilon, update, -1.0)
+    return update, second_moment, momentum
+
+
+class LaProp(torch.optim.Optimizer):
+    """LaProp: RMSProp's normalization first, momentum afterwards. [OPT-8] to [OPT-16] [OPT-20]
+
+    Per parameter the state is "step" (int), "second_moment" and "momentum". There is no weight decay and no clipping: see `clip_gradients_`.
+
+    Raises:
+      ValueError: a beta outside [0, 1).
+    """
+
+    def __init__(self, params: Any, lr: float = 4e-5, betas: tuple[float, float] = (0.9, 0.99), eps: float = 1e-20) -> None:
+        for beta in betas:
+            _correction(beta, 0)
+        super().__init__(params, {"lr": lr, "betas": betas, "eps": eps})
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], Any] | None = None) -> Any:  # type: ignore[override]
+        """One update of every parameter that has a gradient. closure: computes the loss again, with gradients."""
+        loss = None
+        if closure is not None:
+            with torch.enable_grad():
+                loss = closure()
+        for group in self.param_groups:
+            for parameter in group["params"]:
+                if parameter.grad is not None:
+                    self._update(parameter, parameter.grad, group)
+        return loss
+
+    def _update(self, parameter: Tensor, gradient: Tensor, group: dict[str, Any]) -> None:
+        state = self.state[parameter]
+        if not state:
+            state |= {"step": 0, "second_moment": torch.zeros_like(parameter), "momentum": torch.zeros_like(parameter)}
+        tensors = (gradient, state["second_moment"], state["momentum"], parameter)
+        chunks = _chunks(*tensors) if parameter.device.type == "cpu" else [tensors]
+        for part, second_moment, momentum, out in chunks:
+            _laprop_(part, second_moment, momentum, state["step"], *group["betas"], group["eps"], out, group["lr"])
+        state["step"] += 1
+
+
+def _chunks(*tensors: Tensor) -> Iterable[tuple[Tensor, ...]]:
+    """Pieces of CHUNK numbers, where memory allows to walk through the tensors as through vectors."""
+    if not all(x.is_contiguous() for x in tensors):
+        return [tensors]
+    return zip(*(x.view(-1).split(CHUNK) for x in tensors), strict=True)
+
+
+@torch.no_grad()
+def optimizer_step(
+    params: Mapping[str, Tensor], gradients: Mapping[str, Tensor], state: Mapping[str, Any], config: Config
+) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Clips, normalizes and steps every tensor; returns new params and a new state. [OPT-15] to [OPT-21]
+
+    state: {"step": int, "second_moment": {name: tensor}, "momentum": {name: tensor}}.
+    """
+    trees = {"gradients": gradients, "second_moment": state["second_moment"], "momentum": state["momentum"]}
+    for what, tree in trees.items():
+        expect_keys(what, tree, params, exactly=True)
+        for name, x in params.items():
+            expect_shape(f"{what}[{name!r}]", tree[name], x.shape)
+    layout, dtype, step = Layout({name: tuple(x.shape) for name, x in params.items()}), wide_dtype(config), int(state["step"])
+    flat, gradient, second_moment, momentum = (
+        layout.pack(tree[name].to(dtype) for name in params) for tree in (params, *trees.values())
+    )
+    optimizer = flat_optimizer(flat, second_moment, momentum, step, config)
+    flat_step_(optimizer, flat, gradient, layout, config)
+    moments = {"second_moment": layout.views(second_moment), "momentum": layout.views(momentum)}
+    return layout.views(flat), {"step": step + 1, **moments}
+
+
+def flat_optimizer(flat: Tensor, second_moment: Tensor, momentum: Tensor, step: int, config: Config) -> LaProp:
+    """The optimizer of a flat buffer of parameters, with its state in the given buffers."""
+    optimizer = LaProp([flat], config.learning_rate, (config.beta1, config.beta2), config.laprop_epsilon)
+    optimizer.state[flat] = {"step": step, "second_moment": second_moment, "momentum": momentum}
+    return optimizer
+
+
+def flat_step_(optimizer: LaProp, flat: Tensor, gradient: Tensor, layout: Layout, config: Config) -> tuple[Tensor, Tensor]:
+    """The whole step on flat buffers, in place (the gradient is clipped in place too). Returns what `clip_flat_gradients_` does."""
+    norms, factors = clip_flat_gradients_(gradient, flat, layout, config.agc_clip, config.agc_epsilon)
+    optimizer.param_groups[0]["lr"] = learning_rate(optimizer.state[flat]["step"], config)
+    flat.grad = gradient
+    optimizer.step()
+    flat.grad = None
+    return norms, factors

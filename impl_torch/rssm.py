@@ -1,0 +1,202 @@
+"""The recurrent state-space model. Chapter: spec/04-rssm.md.
+
+A state is {"deter" [N, D], "stoch" [N, S, C]}. Functions take the flat mapping of parameters; `prepare` casts and rearranges them once, which
+every function does for itself where its caller has not.
+"""
+
+from collections.abc import Callable, Mapping
+
+import torch
+from torch import Tensor
+
+from impl_torch.distributions import categorical_sample, straight_through, unimix_log_probs
+from impl_torch.layers import Params, block_linear, dense, linear, mlp, norm_silu
+from impl_torch.scan import ScanOptions, ScanWeights, scan
+from impl_torch.shapes import compute_dtype, expect, expect_last, expect_shape, wide_dtype
+from spec import Config
+
+Carry = Mapping[str, Tensor]
+Policy = Callable[[Tensor, int], Tensor]
+
+SHARED, BLOCK = "rssm/hidden/shared", "rssm/hidden/block"
+
+
+def prepare(params: Params, config: Config) -> Params:
+    """The parameters for many calls: kernels in the compute dtype, and those of rssm/hidden split in two. Doing it twice changes nothing.
+
+    Every block of rssm/hidden reads its own memory and the same three embeddings ([RSSM-4]). For the embeddings the kernels of all blocks
+    side by side make one dense product, instead of one over G copies of the embeddings.
+    """
+    if SHARED in params:
+        return params
+    dtype = compute_dtype(config)
+    prepared = {name: x.to(dtype) if name.endswith("/kernel") else x for name, x in params.items()}
+    if "rssm/hidden/kernel" in prepared:
+        own, shared = prepared["rssm/hidden/kernel"].split([config.deter // config.blocks, 3 * config.units], 1)
+        prepared[BLOCK], prepared[SHARED] = own, shared.transpose(0, 1).reshape(3 * config.units, config.deter)
+    return prepared
+
+
+def core(params: Params, deter: Tensor, stoch: Tensor, action: Tensor, config: Config) -> Tensor:
+    """The memory update: [..., D], [..., S, C], [..., A] -> [..., D]. [RSSM-1] to [RSSM-7] [RSSM-24] [RSSM-26] [RSSM-27]"""
+    expect_last("deter", deter, config.deter)
+    expect_shape("stoch", stoch, (*deter.shape[:-1], config.stoch, config.classes))
+    expect_shape("action", action, (*deter.shape[:-1], params["rssm/embed_action/kernel"].shape[0]))
+    params, dtype, epsilon = prepare(params, config), compute_dtype(config), config.norm_epsilon
+    deter, stoch, action = deter.to(dtype), stoch.flatten(-2).to(dtype), _bounded(action.to(dtype))
+    inputs = {"rssm/embed_deter": deter, "rssm/embed_stoch": stoch, "rssm/embed_action": action}
+    embedded = torch.stack([linear(x, params[f"{name}/kernel"], params[f"{name}/bias"]) for name, x in inputs.items()], -2)
+    scale = torch.stack([params[f"{name}/scale"] for name in inputs])
+    embedded = norm_silu(embedded, scale, epsilon).flatten(-2)
+    hidden = linear(embedded, params[SHARED], params["rssm/hidden/bias"]) + block_linear(deter, params[BLOCK], None)
+    hidden = norm_silu(hidden, params["rssm/hidden/scale"], epsilon)
+    gates = block_linear(hidden, params["rssm/gru/kernel"], params["rssm/gru/bias"]).unflatten(-1, (config.blocks, 3, -1))
+    reset, candidate, update = gates.unbind(-2)
+    candidate = torch.tanh(torch.sigmoid(reset) * candidate)
+    memory = deter.unflatten(-1, (config.blocks, -1))
+    return torch.lerp(memory, candidate, torch.sigmoid(update - 1)).flatten(-2)
+
+
+def _bounded(action: Tensor) -> Tensor:
+    """a / sg(max(1, |a|)). [RSSM-2] [RSSM-24]"""
+    return action / action.detach().abs().clamp(min=1)
+
+
+def prior(params: Params, deter: Tensor, config: Config) -> Tensor:
+    """Logits of z given the memory alone, before the mixture: [..., D] -> [..., S, C]. [RSSM-8] [RSSM-10] [RSSM-26]"""
+    expect_last("deter", deter, config.deter)
+    x = mlp(params, "rssm/prior", deter.to(compute_dtype(config)), config.prior_layers, config.norm_epsilon)
+    return _logits(linear(x, params["rssm/prior/out/kernel"], params["rssm/prior/out/bias"]), config)
+
+
+def posterior(params: Params, deter: Tensor, tokens: Tensor, config: Config) -> Tensor:
+    """Logits of z given memory and tokens, before the mixture: [..., D], [..., E] -> [..., S, C]. [RSSM-9] [RSSM-10] [RSSM-26]"""
+    expect_last("deter", deter, config.deter)
+    expect_shape("tokens", tokens, (*deter.shape[:-1], _token_size(params, config)))
+    x = torch.cat([deter, tokens], -1).to(compute_dtype(config))
+    x = mlp(params, "rssm/posterior", x, config.posterior_layers, config.norm_epsilon)
+    return _logits(linear(x, params["rssm/posterior/out/kernel"], params["rssm/posterior/out/bias"]), config)
+
+
+def _token_size(params: Params, config: Config) -> int:
+    return params["rssm/posterior/hidden0/kernel"].shape[0] - config.deter
+
+
+def _logits(x: Tensor, config: Config) -> Tensor:
+    return x.to(wide_dtype(config)).unflatten(-1, (config.stoch, config.classes))
+
+
+def observe_step(
+    params: Params, carry: Carry, tokens: Tensor, prev_action: Tensor, is_first: Tensor, uniform: Tensor, config: Config
+) -> tuple[dict[str, Tensor], Tensor]:
+    """One step with an observation of N rows. [RSSM-11] to [RSSM-16] [RSSM-26]
+
+    carry of N rows, tokens [N, E], prev_action [N, A], is_first [N], uniform [N, S] -> (carry, logits [N, S, C]).
+    """
+    deter, stoch = _check_carry(carry, config)
+    rows = len(deter)
+    expect_shape("tokens", tokens, (rows, _token_size(params, config)))
+    expect_shape("prev_action", prev_action, (rows, params["rssm/embed_action/kernel"].shape[0]))
+    expect_shape("is_first", is_first, (rows,))
+    expect_shape("uniform", uniform, (rows, config.stoch))
+    params, dtype = prepare(params, config), compute_dtype(config)
+    first = is_first.bool()
+    deter, stoch, action = (
+        x.to(dtype).masked_fill(first.view(-1, *[1] * (x.ndim - 1)), 0) for x in (deter, stoch, prev_action)
+    )
+    deter = core(params, deter, stoch, action, config)
+    logits = posterior(params, deter, tokens, config)
+    log_probs = unimix_log_probs(logits, config.latent_unimix)
+    stoch = straight_through(log_probs, categorical_sample(log_probs, uniform))
+    return {"deter": deter, "stoch": stoch.to(dtype)}, logits
+
+
+def observe(
+    params: Params, carry: Carry, tokens: Tensor, prev_action: Tensor, is_first: Tensor, uniform: Tensor, config: Config
+) -> dict[str, Tensor]:
+    """`observe_step` along T steps. [RSSM-11] to [RSSM-19] [RSSM-23] [RSSM-26]
+
+    carry of B rows, tokens [B, T, E], prev_action [B, T, A], is_first [B, T], uniform [B, T, S] ->
+    {"deter" [B, T, D], "stoch" [B, T, S, C], "logits" [B, T, S, C]}.
+    """
+    deter, stoch = _check_carry(carry, config)
+    expect(tokens.ndim == 3 and len(tokens) == len(deter), "tokens", f"shape [{len(deter)}, T, E]", list(tokens.shape))
+    shape = tokens.shape[:2]
+    expect_shape("tokens", tokens, (*shape, _token_size(params, config)))
+    expect_shape("prev_action", prev_action, (*shape, params["rssm/embed_action/kernel"].shape[0]))
+    expect_shape("is_first", is_first, shape)
+    expect_shape("uniform", uniform, (*shape, config.stoch))
+    params, dtype, epsilon = prepare(params, config), compute_dtype(config), config.norm_epsilon
+
+    # What does not depend on the recurrent state leaves the loop: the action's embedding with its share of rssm/hidden, and the tokens' share
+    # of the posterior's first layer.
+    first = is_first.bool().t()
+    action = prev_action.to(dtype).transpose(0, 1).masked_fill(first.unsqueeze(-1), 0)
+    action = dense(params, "rssm/embed_action", _bounded(action), epsilon)
+    shared, shared_action = params[SHARED].split([2 * config.units, config.units])
+    action_drive = linear(action, shared_action, params["rssm/hidden/bias"])
+    post_deter, post_tokens = params["rssm/posterior/hidden0/kernel"].split([config.deter, tokens.shape[-1]])
+    token_drive = linear(tokens.to(dtype).transpose(0, 1), post_tokens, params["rssm/posterior/hidden0/bias"])
+
+    weights = ScanWeights(
+        embed_deter=params["rssm/embed_deter/kernel"],
+        embed_stoch=params["rssm/embed_stoch/kernel"],
+        embed_bias=torch.stack([params["rssm/embed_deter/bias"], params["rssm/embed_stoch/bias"]]).to(dtype),
+        embed_scale=torch.stack([params["rssm/embed_deter/scale"], params["rssm/embed_stoch/scale"]]),
+        shared=shared,
+        block=params[BLOCK],
+        hidden_scale=params["rssm/hidden/scale"],
+        gru=params["rssm/gru/kernel"],
+        gru_bias=params["rssm/gru/bias"].to(dtype),
+        out=params["rssm/posterior/out/kernel"],
+        out_bias=params["rssm/posterior/out/bias"].to(dtype),
+        post_deter=post_deter,
+        post_scale=params["rssm/posterior/hidden0/scale"],
+        deeper=tuple(_layer(params, f"rssm/posterior/hidden{layer}", dtype) for layer in range(1, config.posterior_layers)),
+    )
+    start = torch.cat([deter, stoch.flatten(1)], -1).to(dtype).detach()
+    options = ScanOptions(config.stoch, epsilon, config.latent_unimix)
+    features, logits = scan(options, start, first, uniform.transpose(0, 1), action_drive, token_drive, weights)
+    deter, stoch = features.transpose(0, 1).split([config.deter, config.stoch * config.classes], -1)
+    return {"deter": deter, "stoch": stoch.unflatten(-1, (config.stoch, -1)), "logits": logits.transpose(0, 1)}
+
+
+def _layer(params: Params, name: str, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
+    return params[f"{name}/kernel"], params[f"{name}/bias"].to(dtype), params[f"{name}/scale"]
+
+
+@torch.no_grad()
+def imagine(params: Params, carry: Carry, policy: Policy, uniform: Tensor, config: Config) -> dict[str, Tensor]:
+    """H steps without observations, all constants. [RSSM-20] [RSSM-21] [RSSM-22] [RSSM-25]
+
+    carry of N rows, policy(feature [N, F], t) -> action [N, A], uniform [N, H, S] ->
+    {"deter" [N, H+1, D], "stoch" [N, H+1, S, C], "action" [N, H, A]}.
+    """
+    features, actions = imagine_features(params, carry, policy, uniform, config)
+    deter, stoch = torch.stack(features, 1).split([config.deter, config.stoch * config.classes], -1)
+    return {"deter": deter, "stoch": stoch.unflatten(-1, (config.stoch, -1)), "action": torch.stack(actions, 1)}
+
+
+@torch.no_grad()
+def imagine_features(params: Params, carry: Carry, policy: Policy, uniform: Tensor, config: Config) -> tuple[list[Tensor], list[Tensor]]:
+    """`imagine` as lists over time: H+1 features [N, F], which is what the heads read, and H actions [N, A]."""
+    deter, stoch = _check_carry(carry, config)
+    expect(uniform.ndim == 3, "uniform", "shape [N, H, S]", list(uniform.shape))
+    expect_shape("uniform", uniform, (len(deter), uniform.shape[1], config.stoch))
+    params, dtype = prepare(params, config), compute_dtype(config)
+    deter, stoch = deter.to(dtype), stoch.to(dtype)
+    features, actions = [torch.cat([deter, stoch.flatten(1)], -1)], []
+    for t in range(uniform.shape[1]):
+        actions.append(policy(features[t], t))
+        deter = core(params, deter, stoch, actions[t], config)
+        log_probs = unimix_log_probs(prior(params, deter, config), config.latent_unimix)
+        stoch = categorical_sample(log_probs, uniform[:, t]).to(dtype)
+        features.append(torch.cat([deter, stoch.flatten(1)], -1))
+    return features, actions
+
+
+def _check_carry(carry: Carry, config: Config) -> tuple[Tensor, Tensor]:
+    deter, stoch = carry["deter"], carry["stoch"]
+    expect(deter.ndim == 2 and deter.shape[1] == config.deter, "carry['deter']", f"shape [N, {config.deter}]", list(deter.shape))
+    expect_shape("carry['stoch']", stoch, (len(deter), config.stoch, config.classes))
+    return deter, stoch

@@ -1,0 +1,234 @@
+"""The recurrence over an observed sequence, with a backward pass written by hand.
+
+The steps follow each other, so what must be done inside the loop decides the speed. Autograd would run every step's products backward for
+the kernels too: T times it would write and add up gradients as large as the parameters, each from a few rows. Here the loop back carries
+only the gradient of the state. Every factor that does not depend on it is computed for all steps at once before the loop, and the gradient
+of each kernel is one product over all steps after it. The values are those of `rssm.observe_step`.
+
+Everything here is time-major. T steps, B rows, D = deter, Z = stoch * classes, G blocks, d = units.
+"""
+
+import dataclasses
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from impl_torch.distributions import sample_onehot
+from impl_torch.layers import norm_silu_forward, normalize, silu_slope
+from impl_torch.shapes import widen
+
+
+@dataclasses.dataclass(frozen=True)
+class ScanWeights:
+    """What the loop reads, in the compute dtype."""
+
+    embed_deter: Tensor  # [D, d]
+    embed_stoch: Tensor  # [Z, d]
+    embed_bias: Tensor  # [2, d]: of deter and stoch
+    embed_scale: Tensor  # [2, d]
+    shared: Tensor  # [2d, D]: what rssm/hidden reads of these two embeddings
+    block: Tensor  # [G, D/G, D/G]: what rssm/hidden reads of the block's own memory
+    hidden_scale: Tensor  # [D]
+    gru: Tensor  # [G, D/G, 3D/G]
+    gru_bias: Tensor  # [3D]
+    out: Tensor  # [d, Z]
+    out_bias: Tensor  # [Z]
+    post_deter: Tensor  # [D, d]: what the posterior's first layer reads of the memory
+    post_scale: Tensor  # [d]
+    deeper: tuple[tuple[Tensor, Tensor, Tensor], ...] = ()  # kernel, bias and scale of the posterior's further layers
+
+    def flat(self) -> list[Tensor]:
+        *tensors, deeper = (getattr(self, field.name) for field in dataclasses.fields(self))
+        return tensors + [tensor for layer in deeper for tensor in layer]
+
+    @classmethod
+    def from_flat(cls, tensors: tuple[Tensor, ...]) -> "ScanWeights":
+        count = len(dataclasses.fields(cls)) - 1
+        return cls(*tensors[:count], tuple(zip(*[iter(tensors[count:])] * 3, strict=True)))  # type: ignore[arg-type]
+
+
+@dataclasses.dataclass(frozen=True)
+class ScanOptions:
+    stoch: int
+    epsilon: float
+    unimix: float
+
+
+def scan(
+    options: ScanOptions, carry: Tensor, is_first: Tensor, uniform: Tensor, action_drive: Tensor, token_drive: Tensor, weights: ScanWeights
+) -> tuple[Tensor, Tensor]:
+    """Runs the sequence.
+
+    carry [B, D + Z]: a constant; is_first [T, B] bool; uniform [T, B, S]; action_drive [T, B, D]: what the action and the bias add to
+    rssm/hidden; token_drive [T, B, d]: what the tokens and the bias add to the posterior's first layer.
+    Returns the features [T, B, D + Z] in the compute dtype and the posterior logits [T, B, S, C] in float32 or better.
+    """
+    return _Scan.apply(options, carry, is_first, uniform, action_drive, token_drive, *weights.flat())
+
+
+def _blocks(x: Tensor, blocks: int) -> Tensor:
+    """[..., B, D] -> [..., G, B, D/G], the same memory."""
+    return x.unflatten(-1, (blocks, -1)).transpose(-2, -3)
+
+
+class _Scan(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, options: ScanOptions, carry: Tensor, is_first: Tensor, uniform: Tensor, action_drive: Tensor, token_drive: Tensor, *flat: Tensor
+    ) -> Any:
+        w, epsilon = ScanWeights.from_flat(flat), options.epsilon
+        T, B, D = action_drive.shape
+        G, Z, S, units = len(w.block), w.out.shape[1], options.stoch, w.out.shape[0]
+        new = action_drive.new_empty
+        states, features = new(T, B, D + Z), new(T, B, D + Z)  # what a step starts from, after resets, and what it ends with
+        embed, embedded = new(T, B, 2, units), new(T, B, 2 * units)
+        hidden, activated = new(T, B, D), new(T, G, B, D // G)
+        gates = new(T, G, B, 3, D // G)
+        post = [new(T, B, units) for _ in range(1 + len(w.deeper))]
+        logits = widen(new(0)).new_empty(T, B, S, Z // S)
+        embed_bias, gru_bias, zero = w.embed_bias.unbind(), w.gru_bias.view(G, 1, -1), carry.new_zeros(())
+        feature = carry
+        for t in range(T):
+            torch.where(is_first[t, :, None], zero, feature, out=states[t])
+            deter, stoch, feature = states[t, :, :D], states[t, :, D:], features[t]
+            torch.addmm(embed_bias[0], deter, w.embed_deter, out=embed[t, :, 0])
+            torch.addmm(embed_bias[1], stoch, w.embed_stoch, out=embed[t, :, 1])
+            embedded[t] = norm_silu_forward(embed[t], w.embed_scale, epsilon).flatten(1)
+            torch.addmm(action_drive[t], embedded[t], w.shared, out=hidden[t])
+            _blocks(hidden[t], G).baddbmm_(_blocks(deter, G), w.block)
+            activated[t] = _blocks(norm_silu_forward(hidden[t], w.hidden_scale, epsilon), G)
+            torch.baddbmm(gru_bias, activated[t], w.gru, out=gates[t].flatten(-2))
+            reset, candidate, update = gates[t].unbind(-2)
+            candidate = torch.sigmoid(reset).mul_(candidate).tanh_()
+            torch.lerp(_blocks(deter, G), candidate, torch.sigmoid(update - 1), out=_blocks(feature[:, :D], G))
+            torch.addmm(token_drive[t], feature[:, :D], w.post_deter, out=post[0][t])
+            x = norm_silu_forward(post[0][t], w.post_scale, epsilon)
+            for pre, (kernel, bias, scale) in zip(post[1:], w.deeper, strict=True):
+                torch.addmm(bias, x, kernel, out=pre[t])
+                x = norm_silu_forward(pre[t], scale, epsilon)
+            logits[t] = torch.addmm(w.out_bias, x, w.out).view(B, S, -1)
+            probs = torch.softmax(logits[t], -1)
+            if options.unimix:
+                probs.mul_(1 - options.unimix).add_(options.unimix / probs.shape[-1])
+            feature[:, D:] = sample_onehot(probs, uniform[t]).flatten(1)
+        ctx.options, ctx.kept = options, (states, embed, embedded, hidden, activated, gates, post)
+        ctx.save_for_backward(features, logits, is_first, *flat)
+        return features, logits
+
+    @staticmethod
+    def backward(ctx: Any, by_features: Tensor, by_logits: Tensor) -> Any:  # type: ignore[override]
+        features, logits, is_first, *flat = ctx.saved_tensors
+        states, embed, embedded, hidden, activated, gates, post = ctx.kept
+        w, epsilon = ScanWeights.from_flat(tuple(flat)), ctx.options.epsilon
+        (T, B, D), G = hidden.shape, len(w.block)
+        post_scales = [w.post_scale, *(scale for _, _, scale in w.deeper)]
+        post_kernels = [kernel for kernel, _, _ in w.deeper] + [w.out]
+
+        # Everything that does not wait for the gradient of the state, for all steps at once.
+        back_embed = _NormSiluBack(embed, w.embed_scale, epsilon)
+        back_hidden = _NormSiluBack(hidden, w.hidden_scale, epsilon)
+        back_post = [_NormSiluBack(x, scale, epsilon) for x, scale in zip(post, post_scales, strict=True)]
+        keep, by_deter = _gate_slopes(gates, _blocks(states[..., :D], G))
+        softmax = torch.softmax(logits, -1)
+        mixed = softmax * (1 - ctx.options.unimix)
+
+        by_embed, by_hidden, by_gates = torch.empty_like(embed), torch.empty_like(hidden), torch.empty_like(gates)
+        by_post = [torch.empty_like(x) for x in post]
+        by_out = torch.empty_like(logits).copy_(by_logits)
+        by_state = torch.zeros_like(features[0])  # of what step t + 1 started from
+        for t in reversed(range(T)):
+            by_feature = by_features[t] + by_state
+            straight = by_feature[:, D:].view_as(mixed[t]) * mixed[t]
+            by_out[t] += straight.addcmul_(softmax[t], straight.sum(-1, keepdim=True), value=-1)
+            upstream = by_out[t].flatten(1).to(hidden.dtype)
+            for back, by_pre, kernel in zip(reversed(back_post), reversed(by_post), reversed(post_kernels), strict=True):
+                torch.mm(upstream, kernel.t(), out=back.upstream[t])
+                upstream = back.step(t, by_pre[t])
+            by_memory = torch.addmm(by_feature[:, :D], upstream, w.post_deter.t())
+            torch.mul(_blocks(by_memory, G).unsqueeze(-2), by_deter[t], out=by_gates[t])
+            _blocks(back_hidden.upstream[t], G).copy_(torch.bmm(by_gates[t].flatten(-2), w.gru.mT))
+            upstream = back_hidden.step(t, by_hidden[t])
+            torch.mm(upstream, w.shared.t(), out=back_embed.upstream[t].flatten(1))
+            by_deter_embed, by_stoch_embed = back_embed.step(t, by_embed[t]).unbind(1)
+            torch.mul(_blocks(by_memory, G), keep[t], out=_blocks(by_state[:, :D], G))
+            _blocks(by_state[:, :D], G).baddbmm_(_blocks(upstream, G), w.block.mT)
+            by_state[:, :D].addmm_(by_deter_embed, w.embed_deter.t())
+            torch.mm(by_stoch_embed, w.embed_stoch.t(), out=by_state[:, D:])
+            by_state.masked_fill_(is_first[t, :, None], 0)
+
+        # The gradient of each parameter, over all steps at once.
+        by_logit = by_out.flatten(2).to(hidden.dtype)
+        outputs = [back.output(x.dtype) for back, x in zip(back_post, post, strict=True)]
+        by_later = [*by_post[1:], by_logit]
+        kernels = [_product(x, y) for x, y in zip(outputs, by_later, strict=True)]
+        biases = [_sum(y) for y in by_later]
+        scales = [back.by_scale() for back in back_post]
+        gradients = ScanWeights(
+            embed_deter=_product(states[..., :D], by_embed[..., 0, :]),
+            embed_stoch=_product(states[..., D:], by_embed[..., 1, :]),
+            embed_bias=_sum(by_embed),
+            embed_scale=back_embed.by_scale(),
+            shared=_product(embedded, by_hidden),
+            block=_block_product(_blocks(states[..., :D], G), _blocks(by_hidden, G)),
+            hidden_scale=back_hidden.by_scale(),
+            gru=_block_product(activated, by_gates.flatten(-2)),
+            gru_bias=by_gates.flatten(-2).sum((0, 2), dtype=logits.dtype).flatten(),
+            out=kernels.pop(),
+            out_bias=biases.pop(),
+            post_deter=_product(features[..., :D], by_post[0]),
+            post_scale=scales[0],
+            deeper=tuple(zip(kernels, biases, scales[1:], strict=True)),
+        )
+        flat_gradients = [gradient.to(x.dtype) for gradient, x in zip(gradients.flat(), flat, strict=True)]
+        return None, None, None, None, by_hidden, by_post[0], *flat_gradients
+
+
+class _NormSiluBack:
+    """The way back through silu(rms_norm(x)) at every step of x [T, ..., n]: a step does only what needs its gradient."""
+
+    def __init__(self, x: Tensor, scale: Tensor, epsilon: float) -> None:
+        self.normal, inverse = normalize(x, epsilon)
+        self.scale = scale.to(inverse.dtype)
+        self.slope = silu_slope(self.normal * self.scale)
+        self.gain = self.slope * self.scale * inverse
+        self.upstream = torch.empty_like(x)  # the gradient by the output, filled in step by step and kept for the scale
+
+    def step(self, t: int, by_x: Tensor) -> Tensor:
+        """The gradient by x at step t, given `upstream[t]`, written to by_x."""
+        scaled = self.upstream[t] * self.gain[t]
+        along = (scaled * self.normal[t]).mean(-1, keepdim=True)
+        return torch.addcmul(scaled, self.normal[t], along, value=-1, out=by_x)
+
+    def by_scale(self) -> Tensor:
+        return (self.upstream * self.slope).mul_(self.normal).sum(tuple(range(self.normal.ndim - self.scale.ndim)))
+
+    def output(self, dtype: torch.dtype) -> Tensor:
+        """silu(rms_norm(x)), again."""
+        return torch.nn.functional.silu((self.normal * self.scale).to(dtype))
+
+
+def _gate_slopes(gates: Tensor, deter: Tensor) -> tuple[Tensor, Tensor]:
+    """Derivatives of the new memory by the old one, [T, G, B, D/G], and by the three gates, [T, G, B, 3, D/G]."""
+    reset, candidate, update = widen(gates).unbind(-2)
+    reset, update = torch.sigmoid(reset), torch.sigmoid(update - 1)
+    value = torch.tanh(reset * candidate)
+    by_candidate = update * (1 - value * value) * reset
+    by_reset = by_candidate * candidate * (1 - reset)
+    by_update = (value - deter) * update * (1 - update)
+    return 1 - update, torch.stack([by_reset, by_candidate, by_update], -2)
+
+
+def _product(x: Tensor, y: Tensor) -> Tensor:
+    """The gradient of a kernel: x [T, B, in], y [T, B, out] -> [in, out]."""
+    return x.flatten(0, 1).t() @ y.flatten(0, 1)
+
+
+def _block_product(x: Tensor, y: Tensor) -> Tensor:
+    """The same for every block: x [T, G, B, in/G], y [T, G, B, out/G] -> [G, in/G, out/G]."""
+    return x.permute(1, 3, 0, 2).flatten(2) @ y.transpose(0, 1).flatten(1, 2)
+
+
+def _sum(y: Tensor) -> Tensor:
+    """The gradient of a bias: over steps and rows."""
+    return y.sum((0, 1), dtype=widen(y[:0]).dtype)

@@ -1,0 +1,399 @@
+"""Both learners as training uses them: their state, their random numbers, and what one may take over from the other."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+from safetensors.numpy import load, load_file, save
+
+from conformance.problems import random_batch, random_observations, random_state, small_config, spaces
+from reference_numpy import agent as reference
+from spec import Config, Discrete, Spaces, parameter_table
+from train import checkpoint
+from train.backend import Learner, learner_class
+
+BACKENDS = ("jax", "torch")
+ENVS = 6
+TASK = spaces("vector", "mixed")
+CONFIG = small_config("paper", "float32")
+STATE_GROUPS = ("params", "optimizer/second_moment", "optimizer/momentum")
+
+Arrays = dict[str, np.ndarray]
+
+
+def make(backend: str, seed: int = 0, task: Spaces = TASK, config: Config = CONFIG) -> Learner:
+    return learner_class(backend)(task, config, seed=seed, device="cpu")
+
+
+@pytest.fixture(scope="module", params=BACKENDS)
+def backend(request: pytest.FixtureRequest) -> str:
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def learner(backend: str) -> Learner:
+    """One for all tests that only need what they load into it: compiling takes long."""
+    return make(backend)
+
+
+@pytest.fixture(scope="module")
+def twin(backend: str) -> Learner:
+    """Another of the same seed."""
+    return make(backend)
+
+
+@pytest.fixture(scope="module")
+def fresh(backend: str) -> Arrays:
+    """The state that a run with seed 0 begins with."""
+    return make(backend).state_dict()
+
+
+def middle_of_training(config: Config = CONFIG, task: Spaces = TASK, policy: int = 7, train: int = 10) -> Arrays:
+    """A state in which no number is zero or one."""
+    state = reference.flatten_state(random_state(np.random.default_rng(5), config, task, "float32"))
+    return {**state, "counters/policy": np.array(policy), "counters/train": np.array(train)}
+
+
+def batch(seed: int, config: Config = CONFIG, task: Spaces = TASK) -> Arrays:
+    return random_batch(np.random.default_rng(seed), config, task)
+
+
+def observation(seed: int, task: Spaces = TASK) -> Arrays:
+    return random_observations(np.random.default_rng(seed), task, (ENVS,))
+
+
+def act(learner: Learner, first: int, calls: int) -> list[np.ndarray]:
+    """Everything that some policy steps give, beginning with fresh environments."""
+    carry, results = learner.initial_carry(ENVS), []
+    for call in range(first, first + calls):
+        action, latents, carry = learner.policy(observation(call), np.arange(ENVS) == call, carry)
+        results += [np.array(action), *(np.array(latents[name]) for name in ("deter", "stoch"))]
+    return results
+
+
+def train(learner: Learner, first: int, steps: int) -> list[np.ndarray]:
+    """Everything that some train steps give."""
+    results = []
+    for step in range(first, first + steps):
+        metrics, latents = learner.train_step(batch(step))
+        results += [np.array(metrics[name]) for name in sorted(metrics)] + [np.array(latents[name]) for name in ("deter", "stoch")]
+    return results
+
+
+def equal(a: list[np.ndarray], b: list[np.ndarray]) -> bool:
+    return len(a) == len(b) and all(np.array_equal(x, y) for x, y in zip(a, b, strict=True))
+
+
+def assert_same_state(a: Mapping[str, np.ndarray], b: Mapping[str, np.ndarray]) -> None:
+    assert set(a) == set(b)
+    assert [name for name in a if not np.array_equal(a[name], b[name])] == []
+
+
+# The state
+
+
+@pytest.mark.covers("AGT-1", "AGT-8", "AGT-9", "CON-22", "CON-29", "CON-30")
+@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
+@pytest.mark.parametrize("profile", ["paper", "official"])
+@pytest.mark.parametrize(("observations", "actions"), [("vector", "discrete"), ("image", "continuous"), ("both", "mixed")])
+def test_the_state_has_the_names_shapes_and_types_of_the_chapter(
+    backend: str, observations: str, actions: str, profile: str, dtype: str
+) -> None:
+    task, config = spaces(observations, actions), small_config(profile, dtype)
+    table = parameter_table(config, task)
+    expected = {f"{group}/{name}": (entry.shape, "float32") for group in STATE_GROUPS for name, entry in table.items()}
+    expected |= {f"slow_critic/{name}": (entry.shape, "float32") for name, entry in table.items() if name.startswith("critic/")}
+    expected |= {f"return_range/{end}": ((), "float32") for end in ("low", "high")}
+    expected |= dict.fromkeys(("optimizer/step", "counters/policy", "counters/train"), ((), "int64"))
+    state = make(backend, 0, task, config).state_dict()
+    assert {name: (array.shape, array.dtype.name) for name, array in state.items()} == expected
+    assert all(isinstance(array, np.ndarray) for array in state.values())
+
+
+@pytest.mark.covers("AGT-3", "AGT-4", "AGT-5", "AGT-6", "AGT-7")
+def test_a_fresh_state(backend: str) -> None:
+    config = small_config("paper", "float32", units=64, deter=64, actor_outscale=0.01)
+    state, table = make(backend, 0, TASK, config).state_dict(), parameter_table(config, TASK)
+    kernels = []
+    for name, entry in table.items():
+        value = state[f"params/{name}"]
+        assert not state[f"optimizer/second_moment/{name}"].any()
+        assert not state[f"optimizer/momentum/{name}"].any()
+        if name.startswith("critic/"):
+            np.testing.assert_array_equal(state[f"slow_critic/{name}"], value)
+        if entry.initializer != "truncated_normal":
+            np.testing.assert_array_equal(value, float(entry.initializer == "ones"))
+        elif entry.outscale == 0:
+            assert not value.any(), name
+        else:
+            scale = entry.outscale / entry.fan_in**0.5
+            assert np.abs(value).max() <= 2.2737 * scale
+            assert abs(value.std() / scale - 1) < 4 / value.size**0.5, name
+            assert abs(value.mean()) < 5 * scale / value.size**0.5, name
+            kernels.append(value.ravel()[:16] / scale)
+    assert len(np.unique(np.round(kernels, 6))) == 16 * len(kernels), "kernels share random numbers"
+    assert [state[name] for name in ("optimizer/step", "return_range/low", "return_range/high", "counters/policy", "counters/train")] == [
+        0
+    ] * 5
+
+
+@pytest.mark.covers("AGT-8", "AGT-9", "AGT-10")
+def test_a_state_comes_out_as_it_went_in_through_a_file(learner: Learner) -> None:
+    state = middle_of_training()
+    learner.load_state_dict(load(save({name: np.array(array, order="C") for name, array in state.items()})))
+    assert_same_state(learner.state_dict(), state)
+
+
+@pytest.mark.covers("AGT-9")
+def test_a_checkpoint_of_a_float64_run_is_float32(backend: str, tmp_path: Path) -> None:
+    state = make(backend, 0, TASK, small_config("paper", "float64")).state_dict()
+    path = checkpoint.save(tmp_path, 0, state, {}, {})
+    types = {array.dtype.name for array in load_file(path / "learner.safetensors").values()}
+    assert types == {"float32", "int64"}
+
+
+def test_a_state_is_a_copy(learner: Learner) -> None:
+    given = middle_of_training()
+    learner.load_state_dict(given)
+    for array in given.values():
+        array[...] = 0
+    state = learner.state_dict()
+    assert_same_state(state, middle_of_training())
+    train(learner, 0, 1)
+    act(learner, 0, 1)
+    assert_same_state(state, middle_of_training())
+    after = learner.state_dict()
+    for array in learner.state_dict().values():
+        array[...] = 0
+    assert_same_state(learner.state_dict(), after)
+
+
+@pytest.mark.covers("AGT-10")
+def test_states_that_do_not_fit_are_refused_and_change_nothing(learner: Learner) -> None:
+    learner.load_state_dict(middle_of_training())
+    state = learner.state_dict()
+    wrong = {**state, "params/rssm/gru/bias": np.zeros(7, np.float32), "optimizer/step": np.zeros(1, np.int64), "params/extra": np.zeros(1)}
+    del wrong["slow_critic/critic/out/bias"], wrong["counters/train"]
+    with pytest.raises(ValueError) as error:  # noqa: PT011 - the words are below
+        learner.load_state_dict(wrong)
+    for words in (
+        "params/rssm/gru/bias",
+        "[7]",
+        "[48]",
+        "optimizer/step",
+        "[1]",
+        "params/extra",
+        "slow_critic/critic/out/bias",
+        "counters/train",
+    ):
+        assert words in str(error.value), words
+    assert "params/rssm/gru/kernel" not in str(error.value)
+    assert_same_state(learner.state_dict(), state)
+    transposed = state["params/reward/hidden0/kernel"].T
+    with pytest.raises(ValueError, match="reward/hidden0/kernel"):
+        learner.load_state_dict({**state, "params/reward/hidden0/kernel": transposed})
+
+
+# Random numbers
+
+
+@pytest.mark.covers("CON-16", "LOOP-24")
+def test_the_same_seed_gives_the_same_run(learner: Learner, twin: Learner, fresh: Arrays) -> None:
+    for one in (learner, twin):
+        one.load_state_dict(fresh)
+    results = [[*act(one, 0, 2), *train(one, 0, 2), *act(one, 2, 2)] for one in (learner, twin)]
+    assert equal(*results)
+    assert_same_state(learner.state_dict(), twin.state_dict())
+    assert (learner.state_dict()["counters/policy"], learner.state_dict()["counters/train"]) == (4, 2)
+
+
+@pytest.mark.covers("CON-21", "LOOP-24")
+def test_another_seed_gives_another_run(backend: str, learner: Learner, fresh: Arrays) -> None:
+    other = make(backend, seed=1)
+    begun = other.state_dict()
+    same = [
+        name
+        for name, array in fresh.items()
+        if name.endswith("kernel") and name.startswith("params") and np.array_equal(array, begun[name])
+    ]
+    assert set(same) == {"params/reward/out/kernel", "params/critic/out/kernel"}, "only what starts as zeros"
+    # With the same parameters the noise still differs.
+    for one in (learner, other):
+        one.load_state_dict(middle_of_training())
+    (action, _, stoch), (other_action, _, other_stoch) = act(learner, 0, 1), act(other, 0, 1)
+    assert not np.array_equal(action, other_action)
+    assert not np.array_equal(stoch, other_stoch)
+    assert not np.array_equal(train(learner, 0, 1)[-1], train(other, 0, 1)[-1])
+
+
+@pytest.mark.covers("AGT-10", "LOOP-23", "LOOP-24", "LOOP-26")
+def test_a_resumed_run_goes_on_as_if_it_had_not_stopped(learner: Learner, twin: Learner, fresh: Arrays) -> None:
+    learner.load_state_dict(fresh)
+    act(learner, 0, 3)
+    train(learner, 0, 2)
+    saved = learner.state_dict()
+    twin.load_state_dict(middle_of_training())  # whatever was there before
+    train(twin, 0, 1)
+    twin.load_state_dict(saved)
+    results = [[*act(one, 3, 2), *train(one, 2, 2), *act(one, 5, 1)] for one in (learner, twin)]
+    assert equal(*results)
+    assert_same_state(learner.state_dict(), twin.state_dict())
+
+
+def nudge(state: Arrays, **counters: int) -> Arrays:
+    return {**state, **{f"counters/{name}": np.array(value) for name, value in counters.items()}}
+
+
+@pytest.mark.covers("CON-21", "LOOP-26")
+@pytest.mark.parametrize("counter", ["policy", "train"])
+def test_every_step_has_noise_of_its_own(learner: Learner, fresh: Arrays, counter: str) -> None:
+    """The same state and the same inputs give other samples under another number of the step, and the same under the same."""
+    run: Callable[[Learner, int, int], list[np.ndarray]] = act if counter == "policy" else train
+    samples = []
+    for number in (0, 1, 2, 0):
+        learner.load_state_dict(nudge(fresh, **{counter: number}))
+        samples.append(run(learner, 0, 1)[-1])  # classes of the latents
+    assert np.array_equal(samples[0], samples[3])
+    for i, j in ((0, 1), (1, 2), (0, 2)):
+        assert np.mean(samples[i] != samples[j]) > 0.5, "nearly uniform samples of 5 classes must differ in 4 of 5 places"
+    other = nudge(fresh, **{"train" if counter == "policy" else "policy": 9})
+    learner.load_state_dict(other)
+    assert np.array_equal(run(learner, 0, 1)[-1], samples[0]), "the numbers of one stream depend on the counter of the other"
+
+
+@pytest.mark.covers("CON-21")
+def test_the_numbers_of_one_step_are_independent(learner: Learner, fresh: Arrays) -> None:
+    """Rows, steps, latents and action dimensions do not share random numbers; means are those of the distributions."""
+    learner.load_state_dict(fresh)
+    envs = 512
+    one = {key: np.repeat(value[:1], envs, 0) for key, value in observation(0).items()}
+    action, latents, _ = learner.policy(one, np.ones(envs, bool), learner.initial_carry(envs))
+    arm, buttons, stoch = action[:, :2], action[:, 2:], np.asarray(latents["stoch"])
+    # The fresh actor is nearly uniform: means near 0, standard deviations of the normals near sigmoid(2) (max - min) + min.
+    std = CONFIG.actor_min_std + (CONFIG.actor_max_std - CONFIG.actor_min_std) / (1 + np.exp(-2))
+    columns = [arm[:, 0] / std, arm[:, 1] / std, *(stoch - 2).T / 2**0.5, 2 * buttons[:, 0] - 1, (buttons[:, 2] - 1 / 3) / (2 / 9) ** 0.5]
+    correlation = np.array(columns) @ np.array(columns).T / envs
+    assert np.abs(correlation - np.eye(len(columns))).max() < 6 / envs**0.5
+    assert np.abs(np.mean(columns, axis=1)).max() < 5 / envs**0.5 + 0.05
+    assert len(np.unique(arm)) == arm.size
+    assert abs(np.corrcoef(arm[:-1, 0], arm[1:, 0])[0, 1]) < 5 / envs**0.5
+    _, trained = learner.train_step({key: np.repeat(value[:1], len(value), 0) for key, value in batch(0).items()})
+    rows = np.asarray(trained["stoch"])
+    assert not np.array_equal(rows[0], rows[1]), "rows of a batch share random numbers"
+    assert len(np.unique(rows[0], axis=0)) > 2, "steps of a batch share random numbers"
+
+
+# What does not depend on random numbers
+
+
+def decided(config: Config, task: Spaces) -> Arrays:
+    """A state whose every categorical is certain: samples do not depend on the noise, so that backends can be compared."""
+    state, rng = middle_of_training(config, task), np.random.default_rng(6)
+    classes = {f"rssm/{part}/out": [config.classes] * config.stoch for part in ("posterior", "prior")}
+    classes |= {f"actor/out/{key}/logits": list(space.classes) for key, space in task.actions.items() if isinstance(space, Discrete)}
+    for name, sizes in classes.items():
+        state[f"params/{name}/kernel"][...] = 0
+        state[f"params/{name}/bias"][...] = np.concatenate([60 * np.eye(size)[rng.integers(size)] for size in sizes])
+    return state
+
+
+DECIDED_TASK = Spaces(spaces("vector", "mixed").observations, spaces("vector", "discrete").actions)
+DECIDED_CONFIG = small_config("paper", "float32", latent_unimix=0.0, actor_unimix=0.0)
+
+
+@pytest.fixture(scope="module")
+def decided_learner(backend: str) -> Learner:
+    return make(backend, 3, DECIDED_TASK, DECIDED_CONFIG)
+
+
+@pytest.mark.covers("AGT-10", "AGT-29", "AGT-30")
+def test_a_state_of_one_backend_goes_on_in_the_other() -> None:
+    """The other takes over every number. Where samples are certain, the next steps agree, and their losses with the reference."""
+    task, config = DECIDED_TASK, DECIDED_CONFIG
+    one, other = (make(backend, seed, task, config) for seed, backend in enumerate(BACKENDS))
+    one.load_state_dict(decided(config, task))
+    one.train_step(batch(0, config, task))
+    for first, second in ((one, other), (other, one)):
+        state = first.state_dict()
+        second.load_state_dict(state)
+        assert_same_state(second.state_dict(), state)
+        inputs = batch(int(state["counters/train"]), config, task)
+        (metrics, latents), (other_metrics, other_latents) = first.train_step(inputs), second.train_step(inputs)
+        assert {name for name in metrics if name.startswith("loss/")} <= set(other_metrics)
+        np.testing.assert_array_equal(latents["stoch"], other_latents["stoch"])
+        np.testing.assert_allclose(latents["deter"], other_latents["deter"], atol=1e-5)
+        for name in set(metrics).intersection(other_metrics):
+            np.testing.assert_allclose(float(metrics[name]), float(other_metrics[name]), rtol=2e-4, atol=2e-5, err_msg=name)
+        after, other_after = first.state_dict(), second.state_dict()
+        assert set(after) == set(other_after)
+        for name, value in after.items():
+            np.testing.assert_allclose(value, other_after[name], rtol=1e-3, atol=1e-3 * np.abs(value).max() + 1e-7, err_msg=name)
+        before = reference.unflatten_state({n: x for n, x in state.items() if not n.startswith("counters/")}, parameter_table(config, task))
+        noise = {
+            "posterior": np.full((2, 5, 3), 0.3),
+            "prior": np.full((10, 3, 3), 0.6),
+            "action": np.full((10, 3, task.action_noise_size), 0.9),
+        }
+        range_ = (before["return_range"]["low"], before["return_range"]["high"])
+        _, aux = reference.losses(before["params"], before["slow_critic"], range_, inputs, noise, task, config)
+        for name, value in aux["losses"].items():
+            np.testing.assert_allclose(float(metrics[f"loss/{name}"]), value, rtol=1e-3, atol=1e-4, err_msg=name)
+        for name, value in aux["metrics"].items():
+            np.testing.assert_allclose(float(metrics[name]), value, rtol=1e-3, atol=1e-4, err_msg=name)
+
+
+@pytest.mark.covers("AGT-11", "CON-12", "LOOP-7", "LOOP-8")
+def test_the_policy_carries_latents_and_action_and_resets_rows(decided_learner: Learner) -> None:
+    """Steps of several environments as the reference makes them, with resets of single rows in between."""
+    task, config, state = DECIDED_TASK, DECIDED_CONFIG, decided(DECIDED_CONFIG, DECIDED_TASK)
+    decided_learner.load_state_dict(state)
+    params = {name.removeprefix("params/"): value for name, value in state.items() if name.startswith("params/")}
+    carry = decided_learner.initial_carry(ENVS)
+    expected = {"deter": np.zeros((ENVS, config.deter)), "stoch": np.zeros((ENVS, config.stoch, config.classes))}
+    expected_action = np.zeros((ENVS, task.action_size))
+    noise = {"posterior": np.full((ENVS, config.stoch), 0.5), "action": np.full((ENVS, task.action_noise_size), 0.5)}
+    for step in range(4):
+        is_first = np.array([step == 0] * 3 + [False] * 2 + [step == 2])
+        action, latents, carry = decided_learner.policy(observation(step), is_first, carry)
+        expected, expected_action = reference.policy_step(
+            params, expected, expected_action, observation(step), is_first, noise, task, config
+        )
+        np.testing.assert_array_equal(action, expected_action)
+        np.testing.assert_allclose(latents["deter"], expected["deter"], atol=1e-5)
+        np.testing.assert_array_equal(latents["stoch"], expected["stoch"].argmax(-1))
+
+
+@pytest.mark.covers("CON-5")
+def test_the_first_carry_is_that_of_a_reset(learner: Learner) -> None:
+    results = []
+    for is_first in (True, False):
+        learner.load_state_dict(middle_of_training())
+        action, latents, _ = learner.policy(observation(0), np.full(ENVS, is_first), learner.initial_carry(ENVS))
+        results.append([np.array(action), np.array(latents["deter"]), np.array(latents["stoch"])])
+    assert equal(*results)
+
+
+def test_what_a_learner_returns(learner: Learner) -> None:
+    learner.load_state_dict(middle_of_training())
+    action, latents, _ = learner.policy(observation(0), np.zeros(ENVS, bool), learner.initial_carry(ENVS))
+    assert (action.shape, action.dtype) == ((ENVS, TASK.action_size), np.float32)
+    assert (np.shape(latents["deter"]), np.asarray(latents["deter"]).dtype) == ((ENVS, CONFIG.deter), np.float32)
+    assert np.shape(latents["stoch"]) == (ENVS, CONFIG.stoch)
+    inputs = batch(0)
+    before = {name: array.copy() for name, array in inputs.items()}
+    metrics, latents = learner.train_step(inputs)
+    assert all(np.ndim(value) == 0 and np.isfinite(float(value)) for value in metrics.values())
+    assert {"loss/reward", "loss/actor", "loss/critic", "loss/replay_critic"} <= set(metrics)
+    shape = (CONFIG.batch_size, CONFIG.batch_length)
+    assert (np.shape(latents["deter"]), np.asarray(latents["deter"]).dtype) == ((*shape, CONFIG.deter), np.float32)
+    assert np.shape(latents["stoch"]) == (*shape, CONFIG.stoch)
+    assert np.asarray(latents["stoch"]).dtype.kind in "iu"
+    assert np.asarray(latents["stoch"]).max() < CONFIG.classes
+    assert_same_state(inputs, before)
+
+
+@pytest.mark.parametrize("device", ["tpu9", "cpuu"])
+def test_unknown_devices_are_named(backend: str, device: str) -> None:
+    with pytest.raises(ValueError, match=device):
+        learner_class(backend)(TASK, CONFIG, seed=0, device=device)

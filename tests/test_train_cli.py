@@ -1,0 +1,214 @@
+"""The command line of `train`: presets, hyperparameters, help, and one line with exit code 2 for each mistake."""
+
+import dataclasses
+import subprocess
+import sys
+import types
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from train_fakes import FakeLearner
+
+import train.setup
+from spec import hyperparameters
+from train.cli import build_parser, main, parse
+from train.errors import UserError
+from train.options import presets
+
+SMALL = {"deter": 8, "units": 4, "stoch": 2, "classes": 2, "batch-size": 2, "batch-length": 3, "envs": 2}
+SHORT = {"steps": 60, "eval-every": 0, "eval-episodes": 1, "random-episodes": 1}
+FAST = ["--backend=jax", "--size=tiny", *(f"--{name}={value}" for name, value in {**SMALL, **SHORT}.items())]
+
+
+@dataclasses.dataclass
+class Report:
+    passed: bool
+    worst: float
+    summary: str
+
+
+@pytest.fixture(autouse=True)
+def fakes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Report:
+    """A learner that needs no backend, and a preflight that says what the test wants."""
+    report = Report(True, 1e-7, "3 checks")
+    module = types.ModuleType("conformance.preflight")
+    module.preflight = lambda *arguments: report  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "conformance.preflight", module)
+    monkeypatch.setattr(train.setup, "learner_class", lambda backend: FakeLearner)
+    monkeypatch.chdir(tmp_path)
+    return report
+
+
+def refusal(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """What the command says on stderr; it must be one line, with exit code 2."""
+    capsys.readouterr()
+    assert main(arguments) == 2
+    captured = capsys.readouterr()
+    lines = captured.err.splitlines()
+    assert len(lines) == 1, captured.err
+    assert lines[0].startswith("train: error: ")
+    assert "Traceback" not in captured.out
+    return lines[0]
+
+
+def test_a_run_ends_with_its_result(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*FAST, "--task", "train_fakes:Counting"]) == 0
+    out = capsys.readouterr().out
+    assert "preflight: 3 checks" in out
+    assert out.splitlines()[-1] == "return 50, random 10, ratio 5.00"
+    assert Path("runs/train_fakes-Counting-jax-seed0/curve.png").exists()
+
+
+def test_the_same_command_continues(capsys: pytest.CaptureFixture[str]) -> None:
+    main([*FAST, "--task", "train_fakes:Counting"])
+    assert main([*FAST, "--task", "train_fakes:Counting", "--steps", "90"]) == 0
+    assert "continuing at step 60 from runs/" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("task", "words"),
+    [
+        ("gym:NoSuchGame-v0", ["unknown task", "NoSuchGame"]),
+        ("nonsense", ["unknown task", "dmc:DOMAIN-TASK"]),
+        ("train_fakes:Sequences", ["unsupported space", "'words'", "Sequence"]),
+        ("train_fakes:nan_observation", ["train_fakes:nan_observation", "environment", "step 7", "'observation'", "nan"]),
+        ("train_fakes:wrong_dtype", ["step 3", "'observation'", "dtype", "float32"]),
+        ("train_fakes:wrong_shape", ["step 3", "'observation'", "(3,)", "(2,)"]),
+    ],
+)
+@pytest.mark.parametrize("processes", ["no", "yes"])
+def test_bad_environments(capsys: pytest.CaptureFixture[str], task: str, words: list[str], processes: str) -> None:
+    line = refusal(capsys, *FAST, "--task", task, "--processes", processes, "--random-episodes", "0")
+    assert all(word in line for word in words), line
+
+
+def test_missing_extra(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "dm_env", None)
+    monkeypatch.delitem(sys.modules, "train.envs.dm_control", raising=False)
+    assert "pip install 'dreamer-spec[dm-control]'" in refusal(capsys, *FAST, "--task", "dmc:walker-walk")
+
+
+def test_missing_backend(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    def learner_class(backend: str) -> Any:
+        raise ModuleNotFoundError("No module named 'optax'", name="optax")
+
+    monkeypatch.setattr(train.setup, "learner_class", learner_class)
+    line = refusal(capsys, *FAST, "--task", "train_fakes:Counting")
+    assert "the package optax: pip install 'dreamer-spec[jax]'" in line
+
+
+def test_checkpoint_of_another_configuration(capsys: pytest.CaptureFixture[str]) -> None:
+    main([*FAST, "--task", "train_fakes:Counting"])
+    line = refusal(capsys, *FAST, "--task", "train_fakes:Counting", "--learning-rate", "0.1", "--free-nats", "2")
+    assert "learning_rate: 4e-05 in the checkpoint, 0.1 given; " in line or "learning_rate: 4e-05 in the checkpoint, 0.1 given." in line
+    assert "free_nats: 1.0 in the checkpoint, 2.0 given" in line
+
+
+def test_unwritable_log_directory(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("file").touch()
+    line = refusal(capsys, *FAST, "--task", "train_fakes:Counting", "--logdir", "file/run")
+    assert "cannot write to the log directory file/run" in line
+
+
+def test_failed_preflight(capsys: pytest.CaptureFixture[str], fakes: Report) -> None:
+    fakes.passed, fakes.worst, fakes.summary = False, 0.25, "[RET-2] lambda_return deviates"
+    line = refusal(capsys, *FAST, "--task", "train_fakes:Counting")
+    assert "[RET-2] lambda_return deviates" in line
+    assert "0.25" in line
+    assert main([*FAST, "--task", "train_fakes:Counting", "--no-preflight"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--batch-size", "0"], ["batch_size is 0", "above 0"]),
+        (["--batch-size", "many"], ["--batch-size", "'many'", "whole number"]),
+        (["--learning-rate", "nan"], ["learning_rate", "nan"]),
+        (["--compute-dtype", "int8"], ["--compute-dtype", "int8", "bfloat16"]),
+        (["--cnn-outer", "maybe"], ["--cnn-outer", "maybe"]),
+        (["--cnn-multipliers", "1,x"], ["--cnn-multipliers", "'x'"]),
+        (["--replay-capacity", "5"], ["replay_capacity is 5", "6"]),
+        (["--no-such-thing", "5"], ["--no-such-thing"]),
+        (["--steps", "0"], ["--steps", "at least 1"]),
+        (["--size", "huge"], ["--size", "huge", "200m"]),
+        (["--preset", "nonsense"], ["'nonsense'", "cartpole"]),
+        (["--device", "quantum:0"], ["--device quantum:0", "available"]),
+        (["--backend", "numpy"], ["--backend", "numpy", "torch"]),
+    ],
+)
+def test_invalid_options(capsys: pytest.CaptureFixture[str], arguments: list[str], words: list[str]) -> None:
+    line = refusal(capsys, *FAST, "--task", "train_fakes:Counting", *arguments)
+    assert all(word in line for word in words), line
+
+
+def test_images_that_the_encoder_cannot_halve(capsys: pytest.CaptureFixture[str]) -> None:
+    line = refusal(capsys, *FAST, "--task", "train_fakes:Everything", "--image-size", "50")
+    assert "train_fakes:Everything" in line
+    assert "50" in line
+
+
+# What the options mean
+
+
+def test_precedence_of_base_preset_and_command_line() -> None:
+    default = parse(["--backend", "jax"])
+    cartpole, base = presets()["cartpole"], presets()["base"]
+    assert (default.task, default.steps) == (cartpole["task"], cartpole["steps"])
+    assert default.config.envs == cartpole["hyperparameters"]["envs"]
+    assert default.logdir == Path("runs/CartPole-v1-jax-seed0")
+
+    paper = parse(["--backend", "torch", "--preset", "dmc_proprio", "--task", "dmc:cheetah-run", "--envs", "3", "--seed", "4"])
+    assert (paper.task, paper.action_repeat, paper.steps) == ("dmc:cheetah-run", 2, 500_000)
+    assert (paper.config.replay_ratio, paper.config.envs, paper.config.units) == (512, 3, 256)
+    assert paper.logdir == Path("runs/dmc-cheetah-run-torch-seed4")
+
+    own = parse(["--backend", "jax", "--task", "a:b", "--profile", "official"])
+    assert own.steps == base["steps"]
+    assert own.config.beta2 == 0.999
+
+
+@pytest.mark.parametrize("name", [name for name in presets() if name != "base"])
+def test_presets_are_valid(name: str) -> None:
+    assert parse(["--backend", "jax", "--preset", name]).task
+
+
+def test_every_hyperparameter_is_an_option_in_both_spellings() -> None:
+    samples = {bool: "false", int: "2", float: "0.5", list: "1,2,3"}
+    parser = build_parser()
+    for name, entry in hyperparameters().items():
+        text = entry["choices"][-1] if "choices" in entry else samples[type(entry["value"])]
+        namespace = parser.parse_args(["--backend", "jax", f"--{name.replace('_', '-')}", text])
+        assert getattr(namespace, name) is not None
+    assert parse(["--backend", "jax", "--batch_size=8", "--replay_capacity", "1e5"]).config.batch_size == 8
+    assert parse(["--backend", "jax", "--cnn-multipliers", "1,4"]).config.cnn_multipliers == (1, 4)
+
+
+def test_help_shows_meaning_symbol_and_default(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["--help"])
+    assert stop.value.code == 0
+    text = " ".join(capsys.readouterr().out.split())
+    for name, entry in hyperparameters().items():
+        assert f"--{name.replace('_', '-')}" in text
+        assert entry["help"] in text
+    assert "beta_rep (default 0.1)" in text
+    assert "(default 0.99; official: 0.999)" in text
+    assert "DeepMind" in text
+
+
+def test_whole_numbers_may_be_written_as_powers() -> None:
+    assert parse(["--backend", "jax", "--steps", "1e5"]).steps == 100_000
+    with pytest.raises(UserError, match=r"'1\.5'"):
+        parse(["--backend", "jax", "--steps", "1.5"])
+
+
+def test_the_command_itself_says_one_line() -> None:
+    """Without any of this file's fakes, in a process of its own."""
+    command = [sys.executable, "-m", "train", "--backend", "jax", "--task", "train_fakes:nan_observation", "--batch-size", "-1"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parent.parent, check=False)
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert done.stderr.startswith("train: error: hyperparameter batch_size is -1")
+    assert np.all(done.stdout == "")

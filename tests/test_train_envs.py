@@ -1,0 +1,331 @@
+"""Spaces, values, records and errors of the environments behind `train`."""
+
+import functools
+import sys
+
+import gymnasium
+import numpy as np
+import pytest
+import train_fakes
+from gymnasium import spaces as gym
+
+from reference_numpy.training_loop import environment_action
+from spec import Discrete, Image, Vector
+from train.envs import ContractEnv, Environments, make_env, random_actions, translate
+from train.errors import UserError
+
+TWO = gym.Discrete(2)
+
+
+@pytest.mark.parametrize(
+    ("space", "expected"),
+    [
+        (gym.Box(-1, 1, (3,)), Vector(3)),
+        (gym.Box(-1, 1, (3, 2), np.float64), Vector(6)),
+        (gym.Box(-1, 1, ()), Vector(1)),
+        (gym.Box(0, 1, (4,), bool), Vector(4)),
+        (gym.Box(0, 255, (128,), np.uint8), Vector(128)),
+        (gym.Box(0, 255, (210, 160, 3), np.uint8), Image(64, 64, 3)),
+        (gym.Box(0, 255, (84, 84, 1), np.uint8), Image(64, 64, 1)),
+        (gym.Box(0, 255, (84, 84, 4), np.uint8), Image(64, 64, 4)),
+        (gym.Box(0, 255, (84, 84), np.uint8), Image(64, 64, 1)),
+        (gym.Discrete(5, start=3), Discrete((5,))),
+        (gym.MultiDiscrete([[2, 3], [4, 5]]), Discrete((2, 3, 4, 5))),
+        (gym.MultiBinary((2, 2)), Discrete((2, 2, 2, 2))),
+    ],
+)
+def test_observation_spaces(space: gymnasium.Space, expected: object) -> None:
+    assert translate(space, TWO).spaces.observations == {"observation": expected}
+
+
+@pytest.mark.parametrize(
+    ("space", "expected"),
+    [(gym.Box(-1, 1, (2, 3)), Vector(6)), (gym.Discrete(4, start=-1), Discrete((4,))), (gym.MultiDiscrete([2, 3]), Discrete((2, 3)))],
+)
+def test_action_spaces(space: gymnasium.Space, expected: object) -> None:
+    assert translate(TWO, space).spaces.actions == {"action": expected}
+
+
+@pytest.mark.parametrize(
+    ("observation", "action", "words"),
+    [
+        (gym.Dict({"text": gym.Text(5)}), TWO, ["observation 'text'", "Text"]),
+        (gym.Dict({"a": gym.Dict({"b": gym.Tuple([TWO])})}), TWO, ["observation 'a_b'", "Tuple"]),
+        (gym.Box(0, 255, (3, 64, 64), np.uint8), TWO, ["channels first"]),
+        (gym.Dict({"a": gym.Dict({"b": TWO}), "a_b": TWO}), TWO, ["'a_b'", "rename"]),
+        (gym.Dict({"reward": TWO}), TWO, ["'reward'", "reserved"]),
+        (gym.Dict({}), TWO, ["at least one observation"]),
+        (gym.Box(0, 1, (0,)), TWO, ["'observation'"]),
+        (TWO, gym.Box(0, 5, (2,), np.int32), ["action 'action'", "floats"]),
+    ],
+)
+def test_unsupported_spaces_are_named(observation: gymnasium.Space, action: gymnasium.Space, words: list[str]) -> None:
+    with pytest.raises(UserError) as error:
+        translate(observation, action)
+    assert all(word in str(error.value) for word in words), error.value
+
+
+def test_every_kind_of_observation_becomes_its_array() -> None:
+    env = ContractEnv(train_fakes.Everything(), "t")
+    observation, _ = env.reset()
+    assert env.observation_space.contains(observation)
+    assert observation["camera"].shape == (64, 64, 3)
+    assert (observation["camera"] == 7).all()
+    assert (observation["depth"] == 9).all()
+    expected = {"arm_angle": [0.5], "arm_touch": [1, 0, 1], "room": [2], "items": [1, 0], "matrix": [1, 2, 3, 4]}
+    assert {key: observation[key].tolist() for key in expected} == expected
+    assert observation["arm_angle"].dtype == observation["matrix"].dtype == np.float32
+
+
+def test_every_kind_of_action_becomes_the_environments() -> None:
+    inner = train_fakes.Everything()
+    env = ContractEnv(inner, "t")
+    env.reset()
+    # gear (3 classes), keys_left (2 and 4 classes), move (2 numbers, beyond the bounds)
+    env.step(np.float32([0, 0, 1, 0, 1, 0, 0, 1, 0, -1.5, 0.5]))
+    (action,) = inner.actions
+    assert action["gear"] == 1
+    assert action["keys"]["left"].tolist() == [1, 2]
+    assert action["move"].tolist() == [[0.0, 1.0]]
+
+
+def test_actions_agree_with_the_reference() -> None:
+    low, high = np.float32([-3, 0, -np.inf, -np.inf, 0.5]), np.float32([1, 1e3, np.inf, 0.5, np.inf])
+    translation = translate(TWO, gym.Dict({"a": gym.Discrete(3), "b": gym.Box(low, high), "c": gym.MultiDiscrete([2, 2])}))
+    rng = np.random.default_rng(0)
+    for _ in range(100):
+        flat = rng.normal(size=translation.spaces.action_size).astype(np.float32)
+        ours, theirs = translation.action(flat), environment_action(flat, translation.spaces, {"b": low}, {"b": high})
+        assert ours["a"] == theirs["a"][0]
+        assert ours["c"].tolist() == theirs["c"].tolist()
+        np.testing.assert_allclose(ours["b"], theirs["b"], rtol=1e-6)
+
+
+def test_a_fourth_channel_is_not_opacity() -> None:
+    """Pillow would mix the colours of neighbours by their fourth channel."""
+    rng = np.random.default_rng(0)
+    image = rng.integers(0, 256, (32, 32, 4), np.uint8)
+    resize = translate(gym.Box(0, 255, (32, 32, 4), np.uint8), TWO, image_size=16).observation
+    opaque, transparent = image.copy(), image.copy()
+    opaque[..., 3], transparent[..., 3] = 255, 0
+    first, second = resize(opaque)["observation"], resize(transparent)["observation"]
+    assert (first[..., :3] == second[..., :3]).all()
+    assert np.ptp(first[..., 0]) > 0
+
+
+def test_an_image_of_the_right_size_is_only_copied() -> None:
+    image = np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8)
+    adapted = translate(gym.Box(0, 255, (64, 64, 3), np.uint8), TWO).observation(image)["observation"]
+    assert (adapted == image).all()
+    image[:] = 0
+    assert adapted.any(), "it must be a copy"
+
+
+# Records
+
+
+def _records_of(envs: Environments, steps: int) -> list[dict[str, np.ndarray]]:
+    return [envs.reset([0, 1]), *(envs.step(np.zeros((2, 2), np.float32)) for _ in range(steps))]
+
+
+def _records(processes: bool, steps: int = 11, action_repeat: int = 1) -> list[dict[str, np.ndarray]]:
+    make = functools.partial(make_env, "train_fakes:Counting", action_repeat=action_repeat)
+    envs = Environments(make, 2, processes)
+    try:
+        return _records_of(envs, steps)
+    finally:
+        envs.close()
+
+
+@pytest.mark.parametrize("processes", [False, True])
+def test_each_observation_is_one_record(processes: bool) -> None:
+    """Two episodes and the start of a third; the first terminates, the second is truncated. Nothing is lost, nothing comes twice."""
+    stream = [{key: value[1] for key, value in record.items()} for record in _records(processes)]
+    assert [tuple(record["observation"]) for record in stream] == [(e, t) for e in (0, 1) for t in range(5)] + [(2, 0), (2, 1)]
+    assert [record["reward"] for record in stream] == [0, 1, 2, 3, 4, 0, 11, 12, 13, 14, 0, 21]
+    assert [t for t, record in enumerate(stream) if record["is_first"]] == [0, 5, 10]
+    assert [t for t, record in enumerate(stream) if record["is_last"]] == [4, 9]
+    assert [t for t, record in enumerate(stream) if record["is_terminal"]] == [4]
+    assert stream[0]["reward"].dtype == np.float32
+
+
+def test_action_repeat_sums_rewards_and_stops_at_the_end() -> None:
+    stream = [{key: value[0] for key, value in record.items()} for record in _records(False, steps=4, action_repeat=3)]
+    assert [record["observation"][1] for record in stream] == [0, 3, 4, 0, 3]
+    assert [record["reward"] for record in stream] == [0, 1 + 2 + 3, 4, 0, 11 + 12 + 13]
+    assert [record["is_last"] for record in stream] == [False, False, True, False, False]
+
+
+@pytest.mark.parametrize("processes", [False, True])
+def test_records_and_actions_share_no_memory_with_the_environment(processes: bool) -> None:
+    envs = Environments(functools.partial(make_env, "train_fakes:Counting"), 2, processes)
+    try:
+        record = envs.reset([0, 1])
+        before = {key: value.copy() for key, value in record.items()}
+        action = np.full((2, 2), 0.5, np.float32)
+        envs.step(action)
+        assert all((record[key] == before[key]).all() for key in record)
+        assert (action == 0.5).all()
+        record["observation"][:] = -1
+        record["is_last"][:] = True
+        assert envs.step(action)["observation"].tolist() == [[0, 2], [0, 2]]
+    finally:
+        envs.close()
+
+
+def test_an_adapted_observation_is_a_copy() -> None:
+    """Of every kind: the environment goes on writing into the arrays that it handed out."""
+    inner = train_fakes.Everything()
+    shared = inner.observation()
+    shared["arm"]["angle"] = np.zeros((), np.float32)
+    inner.observation = lambda: shared  # type: ignore[method-assign]
+    first, _ = ContractEnv(inner, "t").reset()
+    before = {key: value.copy() for key, value in first.items()}
+    for value in (shared["camera"], shared["depth"], shared["arm"]["angle"], shared["arm"]["touch"], shared["items"], shared["matrix"]):
+        value[...] = 1
+    assert all((first[key] == before[key]).all() for key in first)
+    counting = ContractEnv(train_fakes.Counting(), "t")
+    vector, _ = counting.reset()
+    counting.step(np.zeros(2, np.float32))
+    assert vector["observation"].tolist() == [0, 0]
+
+
+def test_seeds_decide_what_happens() -> None:
+    def first(seeds: list[int]) -> list[list[float]]:
+        envs = Environments(functools.partial(make_env, "gym:CartPole-v1"), 2, False)
+        actions = np.eye(2, dtype=np.float32)
+        envs.reset(seeds)
+        return [row.tolist() for _ in range(60) for row in envs.step(actions)["observation"]]
+
+    assert first([1, 2]) == first([1, 2])
+    assert first([1, 2]) != first([1, 3])
+
+
+def test_a_time_limit_of_gymnasium_is_no_termination() -> None:
+    envs = Environments(functools.partial(make_env, "gym:Pendulum-v1"), 1, False)
+    envs.reset([0])
+    records = [envs.step(np.zeros((1, 1), np.float32)) for _ in range(200)]
+    assert [bool(record["is_last"][0]) for record in records] == [False] * 199 + [True]
+    assert not any(record["is_terminal"][0] for record in records)
+
+
+def test_random_actions_are_legal_and_cover_the_choices() -> None:
+    spaces = ContractEnv(train_fakes.Everything(), "t").spaces
+    actions = random_actions(spaces, np.random.default_rng(0), 200)
+    assert actions.shape == (200, spaces.action_size)
+    assert actions.dtype == np.float32
+    assert (actions[:, :3].sum(axis=0) > 30).all()
+    assert (actions[:, :3].sum(axis=1) == 1).all()
+    assert (np.abs(actions[:, -2:]) <= 1).all()
+
+
+# Errors
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"observation": np.float32([0, np.nan])}, ["'observation'", "nan"]),
+        ({"observation": np.float64([0, 1e300])}, ["'observation'", "inf"]),
+        ({"observation": np.zeros(3, np.float32)}, ["'observation'", "(3,)", "(2,)"]),
+        ({"observation": np.array(["a", "b"])}, ["'observation'", "<U1", "float32"]),
+        ({"observation": np.zeros(2, complex)}, ["'observation'", "complex128"]),
+        ({"reward": np.nan}, ["reward", "nan"]),
+        ({"reward": np.zeros(2)}, ["reward", "(2,)"]),
+        ({"reward": "1"}, ["reward", "'1'"]),
+        ({"values": 4}, ["4 values", "terminated, truncated"]),
+    ],
+)
+def test_what_the_space_does_not_allow_is_refused(wrong: dict, words: list[str]) -> None:
+    env = ContractEnv(train_fakes.Faulty(3, **wrong), "my:task", index=5)
+    env.reset()
+    env.step(np.zeros(2, np.float32))
+    env.step(np.zeros(2, np.float32))
+    with pytest.raises(UserError) as error:
+        env.step(np.zeros(2, np.float32))
+    assert all(word in str(error.value) for word in ["task my:task, environment 5, step 3", *words]), error.value
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "words"),
+    [
+        ("camera", np.zeros((20, 30, 3), np.float32), ["'camera'", "float32", "uint8"]),
+        ("room", np.int64(15), ["'room'", "15", "outside"]),
+        ("room", 12.0, ["'room'", "float64", "int64"]),
+        ("items", np.array([0, 0]), ["'items'", "outside"]),
+        ("arm", {"angle": 0.5}, ["'arm'", "touch"]),
+        ("arm", 3, ["'arm'", "int", "angle, touch"]),
+    ],
+)
+def test_wrong_entries_are_named(key: str, value: object, words: list[str]) -> None:
+    inner = train_fakes.Everything()
+    observation = inner.observation()
+    inner.observation = lambda: {**observation, key: value}  # type: ignore[method-assign]
+    with pytest.raises(UserError) as error:
+        ContractEnv(inner, "t").reset()
+    assert all(word in str(error.value) for word in words), error.value
+
+
+@pytest.mark.parametrize("processes", [False, True])
+def test_errors_come_through_worker_processes(processes: bool) -> None:
+    envs = Environments(functools.partial(make_env, "train_fakes:nan_observation"), 2, processes)
+    try:
+        with pytest.raises(UserError, match=r"environment [01], step 7: observation 'observation' holds nan"):
+            _records_of(envs, 12)
+    finally:
+        envs.close()
+
+
+def test_errors_of_the_environments_own_code_keep_their_traceback() -> None:
+    env = ContractEnv(train_fakes.Faulty(1, error=ZeroDivisionError("inside")), "t")
+    env.reset()
+    with pytest.raises(RuntimeError, match=r"(?s)step 1: the environment raised ZeroDivisionError: inside.*train_fakes.py"):
+        env.step(np.zeros(2, np.float32))
+
+
+@pytest.mark.parametrize(
+    ("task", "words"),
+    [
+        ("CartPole-v1", ["unknown task", "gym:ID"]),
+        ("gym:NoSuchGame-v0", ["unknown task", "NoSuchGame"]),
+        ("gym:no_such_module:Game-v0", ["unknown task", "no_such_module"]),
+        ("no_such_module:make", ["unknown task", "no_such_module"]),
+        ("train_fakes:no_such_function", ["unknown task", "no_such_function"]),
+        ("train_fakes:FakeLearner.diary", ["unknown task"]),
+        ("builtins:dict", ["dict", "gymnasium.Env"]),
+    ],
+)
+def test_unknown_tasks_are_named(task: str, words: list[str]) -> None:
+    with pytest.raises(UserError) as error:
+        make_env(task)
+    assert all(word in str(error.value) for word in words), error.value
+
+
+def test_a_missing_extra_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ale_py", None)
+    with pytest.raises(UserError, match=r"pip install 'dreamer-spec\[atari\]'"):
+        make_env("gym:ALE/Pong-v5")
+
+
+def test_a_missing_package_of_gymnasium_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "gymnasium.envs.mujoco.half_cheetah_v5", None)
+    monkeypatch.setitem(sys.modules, "gymnasium.envs.mujoco", None)
+    with pytest.raises(UserError, match=r"pip install 'dreamer-spec\[mujoco\]'"):
+        make_env("gym:HalfCheetah-v5")
+
+
+def test_dm_control_from_vectors() -> None:
+    pytest.importorskip("dm_control")
+    env = make_env("dmc:cartpole-balance", action_repeat=2)
+    assert env.spaces.observations == {"position": Vector(3), "velocity": Vector(2)}
+    first, again = env.reset(seed=3)[0], env.reset(seed=3)[0]
+    assert all((first[key] == again[key]).all() for key in first)
+    steps = 0
+    truncated = terminated = False
+    while not (terminated or truncated):
+        _, reward, terminated, truncated, _ = env.step(np.zeros(1, np.float32))
+        steps += 1
+    assert (steps, terminated, truncated) == (500, False, True)
+    assert 0 < reward <= 2
+    with pytest.raises(UserError, match="known: cartpole-balance"):
+        make_env("dmc:cartpole-fly")

@@ -1,0 +1,342 @@
+"""The loop of `train` with a learner that keeps a diary: what is stored, when it trains, what a checkpoint carries over."""
+
+import dataclasses
+import json
+import os
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import train_fakes
+from train_fakes import EPISODE, FakeLearner
+
+from reference_numpy.training_loop import derive_seed
+from train import checkpoint, evaluation, loop, setup
+from train.envs import Environments, make_env
+from train.errors import UserError
+from train.logger import read_metrics
+from train.options import Options, make_options
+
+SMALL = {"deter": 8, "units": 4, "stoch": 2, "classes": 2, "batch_size": 2, "batch_length": 3, "envs": 2, "replay_capacity": 500}
+BATCH_STEPS = SMALL["batch_size"] * SMALL["batch_length"]
+
+Make = Callable[..., Options]
+
+
+@pytest.fixture
+def make(tmp_path: Path) -> Iterator[Make]:
+    FakeLearner.diary.clear()
+
+    def options(**given: Any) -> Options:
+        overrides = {
+            **SMALL,
+            **{name: given.pop(name) for name in list(given) if name in SMALL or name in ("replay_ratio", "learning_rate")},
+        }
+        plain = {"task": "train_fakes:Counting", "steps": 60, "logdir": tmp_path / "run", "preflight": False, "log_every": 0.0}
+        return make_options("jax", {**plain, "eval_every": 0, "eval_episodes": 0, "random_episodes": 0, **given}, overrides)
+
+    yield options
+    FakeLearner.loss = 1.0
+
+
+def run_quietly(options: Options) -> Any:
+    """The state of a run after its loop."""
+    with ExitStack() as stack:
+        state = setup.prepare(options, FakeLearner, stack)
+        loop.train(state)
+        return state
+
+
+def batches() -> list[dict[str, np.ndarray]]:
+    return [entry for kind, entry in FakeLearner.diary if kind == "train"]
+
+
+def stored(state: Any) -> list[dict[str, np.ndarray]]:
+    """The records of each stream of a replay buffer, in order."""
+    saved = state.replay.state_dict()
+    keys = [name for name in saved if name.startswith("records/")]
+    ends = np.cumsum(saved["streams"][:, 2])
+    parts = [slice(end - count, end) for end, count in zip(ends, saved["streams"][:, 2], strict=True)]
+    return [{name.removeprefix("records/"): saved[name][part] for name in keys} for part in parts]
+
+
+# What is stored
+
+
+def test_streams_hold_every_observation_with_what_arrived_with_it(make: Make) -> None:
+    state = run_quietly(make(replay_ratio=0))
+    streams = stored(state)
+    assert len(streams) == 2
+    for worker, stream in enumerate(streams):
+        assert len(stream["reward"]) == 30
+        episode, time = np.divmod(np.arange(30), EPISODE + 1)
+        assert stream["observation"].tolist() == np.stack([episode, time], axis=1).tolist()
+        assert stream["reward"].tolist() == np.where(time == 0, 0, 10 * episode + time).tolist()
+        assert stream["is_first"].tolist() == (time == 0).tolist()
+        assert stream["is_last"].tolist() == (time == EPISODE).tolist()
+        assert stream["is_terminal"].tolist() == ((time == EPISODE) & (episode % 2 == 0)).tolist()
+        # The latents that the policy step made for this observation: its row's steps since the reset, the number of the call.
+        assert stream["deter"][:, 0].tolist() == time.tolist()
+        assert stream["deter"][:, 1].tolist() == list(range(30))
+        expected = [3 * evaluation.random_actions(state.envs.spaces, np.random.default_rng([0, call]), 2)[worker] for call in range(30)]
+        assert stream["action"].tolist() == np.where((time == EPISODE)[:, None], 0, expected).tolist(), "raw, and zeros at the end"
+    assert np.abs(streams[0]["action"]).max() > 1, "the test needs actions that would be clipped"
+
+
+def test_the_environment_gets_clipped_and_scaled_actions() -> None:
+    inner = train_fakes.Counting()
+    env = setup.ContractEnv(inner, "t")
+    env.reset()
+    env.step(np.float32([-2.5, 2.5]))
+    env.step(np.float32([0.5, -0.5]))
+    assert [action.tolist() for action in inner.actions] == [[0, 1], [7.5, -0.5]]
+
+
+# When it trains
+
+
+@pytest.mark.parametrize(("ratio", "envs"), [(0.7, 1), (6, 1), (6, 3), (7.3, 2), (32, 2)])
+def test_the_replay_ratio_is_exact(make: Make, ratio: float, envs: int) -> None:
+    state = run_quietly(make(replay_ratio=ratio, envs=envs, steps=120))
+    steps_together = SMALL["batch_length"] + -(-BATCH_STEPS // envs)
+    start = envs * (steps_together - 1) + (BATCH_STEPS - 1) % envs + 1
+    expected = 1 + int((120 - start) * ratio / BATCH_STEPS + 1e-9)
+    assert state.counters.records == 120
+    assert len(batches()) == state.counters.train_steps == expected
+
+
+def test_no_training_with_ratio_zero(make: Make) -> None:
+    assert run_quietly(make(replay_ratio=0)).counters.train_steps == 0
+
+
+def test_steps_count_action_repeat(make: Make) -> None:
+    state = run_quietly(make(action_repeat=2, steps=60))
+    assert (state.step, state.counters.records) == (60, 30)
+
+
+def test_draws_come_from_the_seed_and_the_train_step(make: Make) -> None:
+    """The rows of a batch that the online queue does not fill are those that the specified numbers draw."""
+    options = make(replay_ratio=BATCH_STEPS * 10, envs=1, steps=10)
+    state = run_quietly(options)
+    items = state.counters.records - SMALL["batch_length"]
+    last = state.counters.train_steps - 1
+    uniform = np.random.Generator(np.random.PCG64(derive_seed(0, "replay", last))).random(2)
+    starts = np.minimum((uniform * items).astype(int), items - 1)
+    time = batches()[-1]["observation"][:, 0] @ [EPISODE + 1, 1]
+    assert time.tolist() == (starts + 1).tolist()
+
+
+def test_latents_are_written_back_before_the_next_draw(make: Make) -> None:
+    state = run_quietly(make(replay_ratio=BATCH_STEPS * 5, envs=1, steps=200))
+    seen = 0
+    for number, batch in enumerate(batches()):
+        contexts = batch["deter"][:, 0]
+        assert (contexts <= 1000 + number).all(), "latents of a train step that was not made yet"
+        assert ((contexts > 1000) | (contexts <= EPISODE)).all()
+        seen += int((contexts == 1000 + number).sum())
+    assert seen > 10, "no batch saw the latents of the train step just before"
+    loop.write_back(state)
+    assert state.pending is None
+    assert state.counters.train_steps + 1000 in np.unique(stored(state)[0]["deter"])
+
+
+# Evaluation
+
+
+def test_evaluation_plays_whole_episodes_and_changes_nothing(make: Make) -> None:
+    def play(**given: Any) -> tuple[Any, list[dict[str, float]]]:
+        state = run_quietly(make(**given))
+        return state, read_metrics(given["logdir"] / "metrics.jsonl")
+
+    root = make().logdir
+    state, lines = play(logdir=root / "a", eval_every=20, eval_episodes=3)
+    plain, _ = play(logdir=root / "b")
+    evaluations = [line for line in lines if "evaluation/return" in line]
+    assert [line["step"] for line in evaluations] == [20, 40]
+    # Workers 0 and 1 play their first episode, worker 0 its second: 1+2+3+4, the same, 11+12+13+14; then episodes go on counting.
+    assert evaluations[0]["evaluation/return"] == pytest.approx((10 + 10 + 50) / 3)
+    assert evaluations[0]["evaluation/return_max"] == 50
+    assert state.counters.records == plain.counters.records
+    assert state.counters.policy_steps == plain.counters.policy_steps
+    assert [stream["reward"].tolist() for stream in stored(state)] == [stream["reward"].tolist() for stream in stored(plain)]
+
+
+def test_episodes_that_do_not_end_are_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(evaluation, "LONGEST_EPISODE", 50)
+    envs = Environments(lambda index: make_env("train_fakes:Endless"), 1, False)
+    with pytest.raises(UserError, match="time limit"):
+        evaluation.play_randomly(envs, 1, 0)
+
+
+# Logs
+
+
+def test_metrics_curve_and_last_words(make: Make, capsys: pytest.CaptureFixture[str]) -> None:
+    options = make(eval_episodes=2, random_episodes=2)
+    assert loop.run(options, FakeLearner)
+    lines = read_metrics(options.logdir / "metrics.jsonl")
+    episodes = [line for line in lines if "episode/return" in line]
+    assert [line["episode/return"] for line in episodes] == [10, 10, 50, 50, 90, 90, 130, 130, 170, 170, 210, 210]
+    assert {line["episode/length"] for line in episodes} == {5}
+    assert any(line.get("train/loss/total") == 1.0 for line in lines)
+    assert [line["step"] for line in lines] == sorted(line["step"] for line in lines)
+    assert (options.logdir / "curve.png").read_bytes().startswith(b"\x89PNG")
+    assert list(options.logdir.glob("events.out.tfevents.*"))
+    assert capsys.readouterr().out.splitlines()[-1] == "return 50, random 10, ratio 5.00"
+
+
+def test_a_loss_that_is_not_finite_stops_the_run_and_spares_the_checkpoint(make: Make) -> None:
+    options = make(steps=30)
+    loop.run(options, FakeLearner)
+    before = checkpoint.find(options.logdir)
+    FakeLearner.loss = float("nan")
+    with pytest.raises(UserError, match=r"diverged.*loss/total"):
+        loop.run(make(steps=60), FakeLearner)
+    assert checkpoint.find(options.logdir) == before
+
+
+# Checkpoints
+
+
+def test_a_resumed_run_goes_on_where_it_stopped(make: Make) -> None:
+    whole = run_quietly(make(steps=120, logdir=make().logdir / "whole"))
+    with ExitStack() as stack:
+        state = setup.prepare(make(steps=60), FakeLearner, stack)
+        loop.train(state)
+        loop.finish(state)
+    half = dataclasses.replace(state.counters)
+    FakeLearner.diary.clear()
+    resumed = run_quietly(make(steps=120))
+    assert resumed.counters.records == 120
+    assert resumed.counters.starts == 2
+    assert resumed.counters.train_steps == whole.counters.train_steps, "an extra train step, or one too few"
+    assert len(batches()) == whole.counters.train_steps - half.train_steps
+    streams = stored(resumed)
+    assert [bool(stream["is_first"][0]) for stream in streams] == [True] * 4, "fresh resets begin new streams"
+    assert sum(len(stream["reward"]) for stream in streams) == 120
+    assert resumed.learner.state_dict()["counters/policy"] == resumed.counters.policy_steps == 60
+    assert sum(kind == "policy" for kind, _ in FakeLearner.diary) == 30
+
+
+def test_a_resumed_run_meets_new_episodes(make: Make) -> None:
+    """Its environments have seeds of their own: they do not begin as those of the first start did."""
+    options = make(task="gym:CartPole-v1", steps=40, replay_ratio=0)
+    loop.run(options, FakeLearner)
+    streams = stored(run_quietly(dataclasses.replace(options, steps=80)))
+    starts = {tuple(stream["observation"][0].tolist()) for stream in streams}
+    assert len(starts) == len(streams) == 4
+
+
+def test_metrics_after_the_checkpoint_are_dropped_on_resume(make: Make) -> None:
+    loop.run(make(), FakeLearner)
+    path = make().logdir / "metrics.jsonl"
+    kept = path.read_text()
+    path.write_text(kept + json.dumps({"step": 70, "seconds": 1.0, "episode/return": -1.0}) + '\n{"step": 71, "sec')
+    loop.run(make(steps=90), FakeLearner)
+    lines = read_metrics(path)
+    assert not any(line.get("episode/return") == -1.0 for line in lines)
+    assert path.read_text().startswith(kept)
+    assert lines[-1]["step"] == 90
+
+
+def test_a_finished_run_says_its_result_again(make: Make, capsys: pytest.CaptureFixture[str]) -> None:
+    options = make(eval_episodes=2, random_episodes=2)
+    loop.run(options, FakeLearner)
+    first = capsys.readouterr().out.splitlines()[-1]
+    FakeLearner.diary.clear()
+    assert loop.run(options, FakeLearner)
+    assert capsys.readouterr().out.splitlines()[-1] == first
+    assert FakeLearner.diary == []
+
+
+def test_another_backend_may_continue(make: Make, capsys: pytest.CaptureFixture[str]) -> None:
+    loop.run(make(), FakeLearner)
+    loop.run(dataclasses.replace(make(steps=90), backend="torch"), FakeLearner)
+    assert "which jax has trained so far" in capsys.readouterr().out
+
+
+def test_another_configuration_is_refused_with_all_differences(make: Make) -> None:
+    loop.run(make(), FakeLearner)
+    other = make(seed=1, learning_rate=1e-3, task="train_fakes:nan_observation")
+    with pytest.raises(UserError) as error:
+        loop.run(other, FakeLearner)
+    assert all(
+        words in str(error.value)
+        for words in (
+            "seed: 0 in the checkpoint, 1 given",
+            "learning_rate: 4e-05 in the checkpoint, 0.001 given",
+            "task: train_fakes:Counting in the checkpoint, train_fakes:nan_observation given",
+        )
+    )
+    assert "batch_size" not in str(error.value)
+
+
+def test_other_spaces_are_refused(make: Make) -> None:
+    loop.run(make(), FakeLearner)
+    saved = checkpoint.find(make().logdir)
+    assert saved
+    spaces = {"observations": {"observation": {"kind": "vector", "size": 3}}, "actions": saved.info["spaces"]["actions"]}
+    with pytest.raises(UserError, match=r'observations observation: {"kind": "vector", "size": 2} in the checkpoint'):
+        checkpoint.require_same_spaces(saved, spaces)
+
+
+@pytest.mark.parametrize("resume", ["never", "must"])
+def test_resume_never_and_must(make: Make, resume: str) -> None:
+    if resume == "never":
+        loop.run(make(), FakeLearner)
+    with pytest.raises(UserError, match=f"--resume is {resume}"):
+        loop.run(make(resume=resume), FakeLearner)
+
+
+def test_a_checkpoint_is_complete_or_absent(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    loop.run(make(), FakeLearner)
+    before = checkpoint.find(make().logdir)
+
+    def fail(*_: Any) -> None:
+        raise OSError("disk full")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoint, "_flush_to_disk", fail)
+        with pytest.raises(UserError, match="disk full"):
+            loop.run(make(steps=90), FakeLearner)
+    assert checkpoint.find(make().logdir) == before
+    loop.run(make(steps=90), FakeLearner)
+    assert [path.name for path in (make().logdir / "checkpoints").iterdir()] == ["000000000090"]
+
+
+@pytest.mark.parametrize("name", ["learner.safetensors", "replay.safetensors", "run.json"])
+def test_a_damaged_checkpoint_is_named(make: Make, name: str) -> None:
+    loop.run(make(), FakeLearner)
+    path = make().logdir / "checkpoints" / "000000000060" / name
+    path.write_bytes(path.read_bytes()[:20])
+    with pytest.raises(UserError, match=r"000000000060.* is damaged"):
+        loop.run(make(steps=90), FakeLearner)
+
+
+def test_the_first_interrupt_saves(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    policy = FakeLearner.policy
+
+    def interrupt(self: FakeLearner, *arguments: Any) -> Any:
+        if self._policy_calls == 20:
+            os.kill(os.getpid(), signal.SIGINT)
+        return policy(self, *arguments)
+
+    handler = signal.getsignal(signal.SIGINT)
+    monkeypatch.setattr(FakeLearner, "policy", interrupt)
+    assert not loop.run(make(), FakeLearner)
+    saved = checkpoint.find(make().logdir)
+    assert saved
+    assert saved.info["counters"]["records"] == 42
+    assert signal.getsignal(signal.SIGINT) is handler
+
+
+def test_the_same_seed_gives_the_same_run(make: Make) -> None:
+    first = stored(run_quietly(make(logdir=make().logdir / "a", task="gym:CartPole-v1")))
+    again = stored(run_quietly(make(logdir=make().logdir / "b", task="gym:CartPole-v1")))
+    other = stored(run_quietly(make(logdir=make().logdir / "c", task="gym:CartPole-v1", seed=1)))
+    assert all((a["observation"] == b["observation"]).all() for a, b in zip(first, again, strict=True))
+    assert not (first[0]["observation"] == other[0]["observation"]).all()

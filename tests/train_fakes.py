@@ -1,0 +1,178 @@
+"""Environments and a learner that the tests of `train` look through: every number that comes out says where it came from."""
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces as gym
+
+from spec import Config, Spaces
+from train.envs import random_actions
+
+EPISODE = 4  # steps of an episode of `Counting`, the reset not counted
+
+
+class Counting(gymnasium.Env[Any, Any]):
+    """Observation [episode, t], reward 10 * episode + t. Episodes 0, 2, ... terminate, the others are truncated.
+
+    A rude environment: it hands out one buffer again and again, and writes into the actions that it is given.
+    """
+
+    observation_space = gym.Box(-np.inf, np.inf, (2,), np.float32)
+    action_space = gym.Box(np.float32([0, -np.inf]), np.float32([10, np.inf]))
+
+    def __init__(self) -> None:
+        self._buffer = np.zeros(2, np.float32)
+        self._episode, self._time = -1, 0
+        self.actions: list[np.ndarray] = []
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        super().reset(seed=seed)
+        self._episode, self._time = self._episode + 1, 0
+        self._buffer[:] = self._episode, 0
+        return self._buffer, {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        self.actions.append(action.copy())
+        action[:] = -99
+        self._time += 1
+        self._buffer[:] = self._episode, self._time
+        end = self._time == EPISODE
+        return self._buffer, 10.0 * self._episode + self._time, end and self._episode % 2 == 0, end and self._episode % 2 == 1, {}
+
+
+class Everything(gymnasium.Env[Any, Any]):
+    """Every kind of observation and of action. Says what it got in `actions`."""
+
+    observation_space = gym.Dict(
+        {
+            "camera": gym.Box(0, 255, (20, 30, 3), np.uint8),
+            "depth": gym.Box(0, 255, (20, 30), np.uint8),
+            "arm": gym.Dict({"angle": gym.Box(-1, 1, (), np.float64), "touch": gym.MultiBinary(3)}),
+            "room": gym.Discrete(5, start=10),
+            "items": gym.MultiDiscrete([2, 3], start=[1, -1]),
+            "matrix": gym.Box(-5, 5, (2, 2), np.int32),
+        }
+    )
+    action_space = gym.Dict(
+        {
+            "move": gym.Box(np.float32([[0, -2]]), np.float32([[10, 2]])),
+            "gear": gym.Discrete(3, start=-1),
+            "keys": gym.Dict({"left": gym.MultiDiscrete([2, 4])}),
+        }
+    )
+
+    def __init__(self) -> None:
+        self.actions: list[Any] = []
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        return self.observation(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        assert self.action_space.contains(action), action
+        self.actions.append(action)
+        return self.observation(), 1.0, False, False, {}
+
+    def observation(self) -> dict[str, Any]:
+        return {
+            "camera": np.full((20, 30, 3), 7, np.uint8),
+            "depth": np.full((20, 30), 9, np.uint8),
+            "arm": {"angle": np.float64(0.5), "touch": np.array([1, 0, 1], np.int8)},
+            "room": np.int64(12),
+            "items": np.array([2, -1]),
+            "matrix": np.array([[1, 2], [3, 4]], np.int32),
+        }
+
+
+class Faulty(Counting):
+    """`Counting`, until its `at`-th step since it was made returns something wrong."""
+
+    def __init__(self, at: int, **wrong: Any) -> None:
+        super().__init__()
+        self._steps, self._at, self._wrong = 0, at, wrong
+
+    def step(self, action: np.ndarray) -> Any:
+        observation, reward, terminated, truncated, info = super().step(action)
+        self._steps += 1
+        if self._steps != self._at:
+            return observation, reward, terminated, truncated, info
+        if "error" in self._wrong:
+            raise self._wrong["error"]
+        result = (self._wrong.get("observation", observation), self._wrong.get("reward", reward), terminated, truncated, info)
+        return result[: self._wrong.get("values", 5)]
+
+
+class Sequences(Counting):
+    observation_space = gym.Dict({"words": gym.Sequence(gym.Discrete(3))})
+
+
+class Endless(Counting):
+    def step(self, action: np.ndarray) -> Any:
+        return (*super().step(action)[:2], False, False, {})
+
+
+def nan_observation() -> gymnasium.Env[Any, Any]:
+    return Faulty(7, observation=np.array([0, np.nan], np.float32))
+
+
+def wrong_dtype() -> gymnasium.Env[Any, Any]:
+    return Faulty(3, observation=np.array(["a", "b"]))
+
+
+def wrong_shape() -> gymnasium.Env[Any, Any]:
+    return Faulty(3, observation=np.zeros(3, np.float32))
+
+
+class FakeLearner:
+    """Obeys train/backend.py in NumPy: random actions, latents that say which call made them, and a diary of what it was given."""
+
+    diary: ClassVar[list[tuple[str, Any]]] = []
+    loss: ClassVar[float] = 1.0
+
+    def __init__(self, spaces: Spaces, config: Config, *, seed: int, device: str | None = None) -> None:
+        if device not in (None, "cpu"):
+            raise ValueError(f"no device {device!r}; available: cpu")
+        self.device = "cpu"
+        self._spaces, self._config, self._seed = spaces, config, seed
+        self._policy_calls = self._train_calls = 0
+
+    def initial_carry(self, envs: int) -> Any:
+        return np.zeros(envs, int)
+
+    def policy(
+        self, observation: Mapping[str, np.ndarray], is_first: np.ndarray, carry: Any
+    ) -> tuple[np.ndarray, dict[str, np.ndarray], Any]:
+        """deter[0] counts the policy steps since the last reset of the row, deter[1] is the number of the call."""
+        assert set(observation) == set(self._spaces.observations)
+        rng = np.random.default_rng([self._seed, self._policy_calls])
+        action = 3 * random_actions(self._spaces, rng, len(is_first))
+        carry = np.where(is_first, 0, carry + 1)
+        deter = np.zeros((len(is_first), self._config.deter), np.float32)
+        deter[:, 0], deter[:, 1] = carry, self._policy_calls
+        self._policy_calls += 1
+        self.diary.append(("policy", {key: value.copy() for key, value in observation.items()}))
+        return action, {"deter": deter, "stoch": np.zeros((len(is_first), self._config.stoch), np.int32)}, carry
+
+    def train_step(self, batch: Mapping[str, np.ndarray]) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        """The latents that are to be written back are 1000 + the number of the train step."""
+        assert set(batch) == {*self._spaces.observations, "reward", "is_first", "is_last", "is_terminal", "prev_action", "deter", "stoch"}
+        self._train_calls += 1
+        self.diary.append(("train", {key: value.copy() for key, value in batch.items()}))
+        shape = (self._config.batch_size, self._config.batch_length)
+        deter = np.full((*shape, self._config.deter), 1000 + self._train_calls, np.float32)
+        return {"loss/total": np.float32(self.loss)}, {"deter": deter, "stoch": np.ones((*shape, self._config.stoch), np.int32)}
+
+    def state_dict(self) -> dict[str, np.ndarray]:
+        return {
+            "params/w": np.arange(6.0, dtype=np.float32).reshape(2, 3).T,  # not contiguous
+            "counters/policy": np.array(self._policy_calls),
+            "counters/train": np.array(self._train_calls),
+        }
+
+    def load_state_dict(self, state: Mapping[str, np.ndarray]) -> None:
+        if set(state) != set(self.state_dict()):
+            raise ValueError(f"unexpected names {sorted(state)}")
+        assert state["params/w"].tolist() == self.state_dict()["params/w"].tolist()
+        self._policy_calls, self._train_calls = int(state["counters/policy"]), int(state["counters/train"])

@@ -1,0 +1,17 @@
+"""Environments in the form of spec/00-notation.md: tasks by name, spaces and values translated and checked, many run in parallel."""
+
+from train.envs.adapter import ContractEnv
+from train.envs.factory import make_env
+from train.envs.spaces import Translation, random_actions, translate
+from train.envs.vector import Environments, Record, is_slow
+
+__all__ = [
+    "ContractEnv",
+    "Environments",
+    "Record",
+    "Translation",
+    "is_slow",
+    "make_env",
+    "random_actions",
+    "translate",
+]

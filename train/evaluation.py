@@ -1,0 +1,70 @@
+"""Episodes that are played but not learned from: evaluation of the agent, and what a random policy gets."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from reference_numpy.training_loop import derive_seed
+from train.backend import Learner
+from train.envs import Environments, Record, random_actions
+from train.errors import UserError
+
+LONGEST_EPISODE = 108_000  # records
+
+Act = Callable[[Record], np.ndarray]
+
+
+def play(envs: Environments, act: Act, episodes: int, seeds: list[int]) -> list[float]:
+    """The returns of `episodes` whole episodes, undiscounted: [LOOP-20].
+
+    Each environment plays its share. The first `episodes` to end, wherever they do, would be the short ones.
+
+    Raises:
+      UserError: an episode that does not end.
+    """
+    share = np.full(envs.count, episodes // envs.count) + (np.arange(envs.count) < episodes % envs.count)
+    returns: list[list[float]] = [[] for _ in range(envs.count)]
+    total, length = np.zeros(envs.count), np.zeros(envs.count, int)
+    record = envs.reset(seeds)
+    while True:
+        total = np.where(record["is_first"], 0.0, total) + record["reward"]
+        length = np.where(record["is_first"], 0, length) + 1
+        for worker in np.flatnonzero(record["is_last"]):
+            if len(returns[worker]) < share[worker]:
+                returns[worker].append(float(total[worker]))
+        if all(len(scores) == wanted for scores, wanted in zip(returns, share, strict=True)):
+            return [score for scores in returns for score in scores]
+        if length.max() > LONGEST_EPISODE:
+            raise UserError(
+                f"an episode did not end within {LONGEST_EPISODE:,} steps, so it has no return; give the environment a time limit "
+                "(gymnasium.wrappers.TimeLimit), or --eval-episodes 0 --random-episodes 0"
+            )
+        record = envs.step(act(record))
+
+
+class Agent:
+    """Acts as the learner does, with a carry of its own that starts at zero."""
+
+    def __init__(self, learner: Learner, envs: Environments) -> None:
+        self._learner = learner
+        self._carry: Any = learner.initial_carry(envs.count)
+        self._keys = list(envs.spaces.observations)
+
+    def __call__(self, record: Record) -> np.ndarray:
+        observation = {key: record[key] for key in self._keys}
+        action, _, self._carry = self._learner.policy(observation, record["is_first"], self._carry)
+        return np.asarray(action)
+
+
+def evaluate(learner: Learner, envs: Environments, episodes: int, seed: int, earlier: int) -> list[float]:
+    """Returns of the agent as it is now, sampling its actions: [LOOP-18], [LOOP-19]. earlier: evaluations of this run before."""
+    seeds = [derive_seed(seed, "evaluation_environment", worker + envs.count * earlier) for worker in range(envs.count)]
+    return play(envs, Agent(learner, envs), episodes, seeds)
+
+
+def play_randomly(envs: Environments, episodes: int, seed: int) -> list[float]:
+    """Returns of the policy that ignores what it sees: every choice and every real number in [-1, 1) equally likely."""
+    rng = np.random.default_rng(derive_seed(seed, "random_policy", 0))
+    seeds = [derive_seed(seed, "random_environment", worker) for worker in range(envs.count)]
+    return play(envs, lambda record: random_actions(envs.spaces, rng, envs.count), episodes, seeds)

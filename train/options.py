@@ -1,0 +1,84 @@
+"""What a run is: its options, made of [base], a preset and the command line, later ones winning."""
+
+import dataclasses
+import functools
+import re
+import tomllib
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from spec import Config, load_config
+from train.errors import UserError
+
+DEFAULT_PRESET = "cartpole"
+RESUME = ("auto", "never", "must")
+PROCESSES = ("auto", "yes", "no")
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Everything that a run depends on, beside the code.
+
+    steps and eval_every are environment steps: records times action_repeat. checkpoint_every and log_every are seconds.
+    """
+
+    backend: str
+    task: str
+    config: Config
+    logdir: Path
+    steps: int
+    seed: int = 0
+    device: str | None = None
+    action_repeat: int = 1
+    image_size: int = 64
+    eval_every: int = 0
+    eval_episodes: int = 10
+    random_episodes: int = 10
+    checkpoint_every: float = 300.0
+    log_every: float = 5.0
+    resume: str = "auto"
+    processes: str = "auto"
+    preflight: bool = True
+
+    def identity(self) -> dict[str, Any]:
+        """What a checkpoint must agree in to be continued. The backend is not in it: either continues what the other began."""
+        run = {name: getattr(self, name) for name in ("task", "seed", "action_repeat", "image_size")}
+        config = {name: list(value) if isinstance(value, tuple) else value for name, value in dataclasses.asdict(self.config).items()}
+        return run | config
+
+
+@functools.cache
+def presets() -> dict[str, dict[str, Any]]:
+    """Name -> settings of presets.toml, [base] included."""
+    return tomllib.loads(resources.files("train").joinpath("presets.toml").read_text(encoding="utf-8"))
+
+
+def make_options(backend: str, given: Mapping[str, Any], hyperparameters: Mapping[str, Any], preset: str | None = None) -> Options:
+    """The options of a run: `given` by name of the fields of Options, plus "profile" and "size"; hyperparameters by their names.
+
+    Raises:
+      UserError: an unknown preset, profile, size or hyperparameter, or a value that no run could have.
+    """
+    known = [name for name in presets() if name != "base"]
+    if preset is not None and preset not in known:
+        raise UserError(f"unknown preset {preset!r}; known: {', '.join(known)}")
+    if preset is None and "task" not in given:
+        preset = DEFAULT_PRESET
+    chosen = presets()[preset] if preset else {}
+    settings = {**presets()["base"], **chosen, **given}
+    overrides = {**chosen.get("hyperparameters", {}), **hyperparameters}
+    try:
+        config = load_config(settings.pop("profile"), settings.pop("size"), **overrides)
+    except ValueError as error:
+        raise UserError(str(error)) from error
+    settings = {name: value for name, value in settings.items() if name not in ("help", "hyperparameters")}
+    settings.setdefault("logdir", default_logdir(settings["task"], backend, settings.get("seed", 0)))
+    return Options(backend=backend, config=config, **settings)
+
+
+def default_logdir(task: str, backend: str, seed: int) -> Path:
+    """runs/<task>-<backend>-seed<k>, the task without its suite and without characters that file systems dislike."""
+    name = re.sub(r"[^A-Za-z0-9_.-]+", "-", task.removeprefix("gym:").replace(":", "-"))
+    return Path("runs") / f"{name}-{backend}-seed{seed}"

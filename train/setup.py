@@ -1,0 +1,162 @@
+"""From options to a run that is ready to start: whatever the user may have got wrong is found here."""
+
+import functools
+import math
+from contextlib import ExitStack, closing
+
+import numpy as np
+
+from reference_numpy.replay import Replay
+from reference_numpy.training_loop import ReplayRatio
+from spec import Spaces, parameter_table
+from train import checkpoint
+from train.backend import Learner, learner_class
+from train.checkpoint import Checkpoint
+from train.envs import ContractEnv, Environments, is_slow, make_env
+from train.errors import UserError
+from train.evaluation import play_randomly
+from train.logger import Display, Logger
+from train.options import Options
+from train.state import Counters, Run
+
+
+def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -> Run:
+    """Everything that can go wrong is tried here, the cheap things first. What must be closed is left to the stack."""
+    _require_writable(options)
+    _require_trainable(options)
+    saved = _find_checkpoint(options)
+    if saved:
+        checkpoint.require_same_identity(saved, options.identity())
+    learner_type = learner or _import_learner(options.backend)
+    envs, test_envs = _make_environments(options, stack)
+    if saved:
+        checkpoint.require_same_spaces(saved, envs.spaces.to_json())
+    parameters = _count_parameters(options, envs.spaces)
+    step = saved.info["counters"]["records"] * options.action_repeat if saved else 0
+    display = Display(options.steps)
+    agent = _make_learner(learner_type, options, envs.spaces)  # Before preflight: it says what is wrong with the device.
+    if options.preflight:
+        _preflight(options, envs.spaces, display)
+    run = Run(
+        options=options,
+        envs=envs,
+        test_envs=test_envs,
+        learner=agent,
+        replay=Replay(options.config.replay_capacity, options.config.batch_length),
+        ratio=ReplayRatio(options.config.replay_ratio, options.config.batch_size * options.config.batch_length),
+        logger=stack.enter_context(closing(Logger(options.logdir, step))),
+        display=display,
+        counters=Counters(),
+    )
+    display.say(
+        f"{options.task}: {options.backend} on {run.learner.device}, {parameters:,} parameters, {envs.count} environments, "
+        f"seed {options.seed}; logs in {options.logdir}"
+    )
+    if saved:
+        _restore(run, saved)
+    else:
+        _measure_random_policy(run)
+    return run
+
+
+def _require_writable(options: Options) -> None:
+    try:
+        options.logdir.mkdir(parents=True, exist_ok=True)
+        probe = options.logdir / ".writable"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise UserError(f"cannot write to the log directory {options.logdir}: {error.strerror}; choose another with --logdir") from error
+
+
+def _require_trainable(options: Options) -> None:
+    """[LOOP-13]: with fewer items than a batch has time steps, training would never start."""
+    config = options.config
+    if config.replay_capacity < config.batch_size * config.batch_length:
+        raise UserError(
+            f"hyperparameter replay_capacity is {config.replay_capacity}; expected at least batch_size x batch_length = "
+            f"{config.batch_size * config.batch_length}, or training would never start"
+        )
+
+
+def _find_checkpoint(options: Options) -> Checkpoint | None:
+    saved = checkpoint.find(options.logdir)
+    if saved and options.resume == "never":
+        raise UserError(f"{options.logdir} holds a run already, and --resume is never; choose another --logdir")
+    if not saved and options.resume == "must":
+        raise UserError(f"{options.logdir} holds no checkpoint, and --resume is must")
+    return saved
+
+
+def _import_learner(backend: str) -> type[Learner]:
+    try:
+        return learner_class(backend)
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.startswith("impl_"):
+            raise
+        raise UserError(f"the backend {backend} needs the package {error.name}: pip install 'dreamer-spec[{backend}]'") from error
+
+
+def _make_environments(options: Options, stack: ExitStack) -> tuple[Environments, Environments | None]:
+    """The environments of training, and those of evaluation if there is any."""
+    make = functools.partial(_make_one, options)
+    slow = is_slow(make, options.seed) if options.processes == "auto" else options.processes == "yes"
+    count = options.config.envs
+    envs = stack.enter_context(closing(Environments(make, count, processes=slow and count > 1)))
+    tests = min(count, max(options.eval_episodes, options.random_episodes))
+    if not tests:
+        return envs, None
+    return envs, stack.enter_context(closing(Environments(make, tests, processes=slow and tests > 1)))
+
+
+def _make_one(options: Options, index: int) -> ContractEnv:
+    return make_env(options.task, index, options.image_size, options.action_repeat)
+
+
+def _count_parameters(options: Options, spaces: Spaces) -> int:
+    try:
+        return sum(math.prod(parameter.shape) for parameter in parameter_table(options.config, spaces).values())
+    except ValueError as error:
+        raise UserError(f"task {options.task}: {error}") from error
+
+
+def _preflight(options: Options, spaces: Spaces, display: Display) -> None:
+    from conformance.preflight import preflight
+
+    report = preflight(options.backend, spaces, options.config, options.device)
+    if not report.passed:
+        raise UserError(
+            f"the backend {options.backend} failed preflight, it deviates from the reference by {report.worst:.3g}: {report.summary}. "
+            "Training would be in vain; --no-preflight skips this check"
+        )
+    display.say(f"preflight: {report.summary} (worst deviation {report.worst:.3g})")
+
+
+def _make_learner(learner: type[Learner], options: Options, spaces: Spaces) -> Learner:
+    try:
+        return learner(spaces, options.config, seed=options.seed, device=options.device)
+    except ValueError as error:  # Spaces and configuration have been checked: what is left is the device.
+        raise UserError(f"the backend {options.backend} does not run with --device {options.device}: {error}") from error
+
+
+def _restore(run: Run, saved: Checkpoint) -> None:
+    """Continues where the checkpoint stopped: [LOOP-23]."""
+    info = saved.info
+    try:
+        run.learner.load_state_dict(saved.learner)
+        run.replay.load_state_dict(saved.replay)
+    except ValueError as error:
+        raise UserError(f"the checkpoint {saved.path} does not fit this version: {error}") from error
+    run.ratio.load_state_dict(info["replay_ratio"])
+    run.counters = Counters(**info["counters"])
+    run.random_return, run.evaluation = info["random_return"], info["evaluation"]
+    made_by = "" if info["backend"] == run.options.backend else f", which {info['backend']} has trained so far"
+    run.display.say(f"continuing at step {run.step:,} from {saved.path}{made_by}")
+
+
+def _measure_random_policy(run: Run) -> None:
+    if run.options.random_episodes and run.test_envs:
+        returns = play_randomly(run.test_envs, run.options.random_episodes, run.options.seed)
+        run.random_return = float(np.mean(returns))
+        run.logger.write(0, 0.0, {"random/return": run.random_return})
+        run.display.say(f"a random policy gets {run.random_return:.4g} (mean of {len(returns)} episodes)")
