@@ -22,7 +22,6 @@ from spec import Config
 
 Arrays = Mapping[str, jax.Array]
 
-_SMALL = 1 << 16  # numbers in a tensor that is cheap to copy
 _DEAD_ZONE = 1e-16  # gradients below it count as zero: their squares would leave the normal numbers of float32 [OPT-9]
 
 
@@ -113,37 +112,20 @@ def optimizer_step_with_metrics(
     step, rate = state["step"], learning_rate(state["step"], config)
     new: dict[str, dict[str, jax.Array]] = {"params": {}, "second_moment": {}, "momentum": {}}
     lengths, moves, factors = [], [], []
-    for names in _groups(params):
-        sources = (params, gradients, state["second_moment"], state["momentum"])
-        parameter, gradient, *moments = (jnp.stack([source[name] for name in names]) for source in sources)
-        clip_factor = jax.vmap(lambda g, p: _clip_factor(g, p, config.agc_clip, config.agc_epsilon))
-        factor, length = clip_factor(gradient, parameter)
-        gradient = gradient * factor.reshape(-1, *(1,) * (gradient.ndim - 1))
-        update, second_moment, momentum = laprop(gradient, *moments, step, config)
-        for kind, stacked in (("params", parameter - rate * update), ("second_moment", second_moment), ("momentum", momentum)):
-            new[kind] |= {name: stacked[index] for index, name in enumerate(names)}
+    for name, parameter in params.items():
+        factor, length = _clip_factor(gradients[name], parameter, config.agc_clip, config.agc_epsilon)
+        moments = state["second_moment"][name], state["momentum"][name]
+        update, new["second_moment"][name], new["momentum"][name] = laprop(gradients[name] * factor, *moments, step, config)
+        new["params"][name] = parameter - rate * update
         lengths.append(length)
         moves.append(jnp.sum(jnp.square(update)))
         factors.append(factor)
     metrics = {
-        "gradient_norm": norm(jnp.concatenate(lengths)),
+        "gradient_norm": norm(jnp.stack(lengths)),
         "update_norm": jnp.sqrt(jnp.sum(jnp.stack(moves))) * rate,
-        "clip_fraction": jnp.mean((jnp.concatenate(factors) < 1).astype(jnp.float32)),
+        "clip_fraction": jnp.mean((jnp.stack(factors) < 1).astype(jnp.float32)),
     }
-    params, second_moment, momentum = ({name: new[kind][name] for name in params} for kind in ("params", "second_moment", "momentum"))
-    return params, {"step": step + 1, "second_moment": second_moment, "momentum": momentum}, metrics
-
-
-def _groups(params: Arrays) -> list[list[str]]:
-    """Names of tensors that are updated together: the small ones of one shape, so that there is less to compile and to launch.
-
-    Large tensors stay alone, because stacking copies them.
-    """
-    groups: dict[tuple[Any, ...], list[str]] = {}
-    for name, parameter in params.items():
-        alone = (name,) if parameter.size > _SMALL else ()
-        groups.setdefault((*parameter.shape, parameter.dtype, *alone), []).append(name)
-    return list(groups.values())
+    return new["params"], {"step": step + 1, "second_moment": new["second_moment"], "momentum": new["momentum"]}, metrics
 
 
 def _check_names(params: Arrays, gradients: Arrays, state: Mapping[str, Any]) -> None:

@@ -1,5 +1,6 @@
 """The agent: initial state, policy step, losses, train step. Chapter: spec/10-agent.md."""
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
@@ -21,11 +22,11 @@ from impl_torch.layers import Params, truncated_normal
 from impl_torch.networks import Observations, actor, continue_head, critic, encoder, feature, reward_head
 from impl_torch.optimizer import optimizer_step
 from impl_torch.returns import cumulative_weights, lambda_return, replay_lambda_return, return_scale, update_return_range
-from impl_torch.rssm import Carry, imagine_features, observe, observe_step, prepare
+from impl_torch.rssm import Carry, freeze, imagine_features, observe, observe_step, prepare
 from impl_torch.shapes import expect_keys, expect_shape, wide_dtype
 from impl_torch.transforms import standard_bins
 from impl_torch.world_model import continue_target, world_model_losses
-from spec import Config, Parameter, Spaces
+from spec import Config, Parameter, Spaces, parameter_table
 
 Range = tuple[Tensor, Tensor]
 State = Mapping[str, Any]
@@ -91,12 +92,11 @@ def losses(
 
     return_range: (low, high); batch: observations [B, T, ...], "reward", "is_first", "is_last", "is_terminal" [B, T], "prev_action" [B, T, A],
     "deter" [B, D], "stoch" [B, S] class indices; noise: "posterior" [B, T, S], "prior" [N, H, S], "action" [N, H, K].
-    aux: "losses" {name: scalar}, "return_range", "deter" [B, T, D], "stoch" [B, T, S, C] and "metrics" {name: scalar}.
+    aux: "losses" {name: scalar} with gradients, "return_range", "deter" [B, T, D], "stoch" [B, T, S, C] and "metrics" {name: scalar}.
     """
-    expect_keys("batch", batch, (*spaces.observations, "reward", "is_first", "is_last", "is_terminal", "prev_action", "deter", "stoch"))
-    expect_keys("noise", noise, ("posterior", "prior", "action"))
-    params, slow_critic = prepare(params, config), prepare(slow_critic, config)
-    B, T = batch["reward"].shape
+    B, T = _check(params, batch, noise, spaces, config)
+    params = prepare(params, config)
+    frozen, slow_critic = freeze(params, config), freeze(slow_critic, config)
     H = config.imagination_horizon
     dtype = wide_dtype(config)
     bins = standard_bins(config.bins, dtype, batch["reward"].device)
@@ -116,16 +116,16 @@ def losses(
             outputs.append(actor(params, state, spaces, config))
         return sample_action(outputs[-1], noise["action"][:, t], spaces, config)
 
-    features, actions = imagine_features(params, {name: x.flatten(0, 1) for name, x in constants.items()}, policy, noise["prior"], config)
+    features, actions = imagine_features(frozen, {name: x.flatten(0, 1) for name, x in constants.items()}, policy, noise["prior"], config)
     logits = _over_time(lambda x: critic(params, x, config), features[:H])
     with torch.no_grad():
         slow_logits = _over_time(lambda x: critic(slow_critic, x, config), features[:H])
-        reward = _over_time(lambda x: symexp_twohot_mean(reward_head(params, x, config), bins), features[1:])
+        reward = _over_time(lambda x: symexp_twohot_mean(reward_head(frozen, x, config), bins), features[1:])
         reward = F.pad(reward, (1, 0))  # the reward of state 0 has been earned: no formula reads it
-        continue_ = _over_time(lambda x: bernoulli_mean(continue_head(params, x, config)), features)
+        continue_ = _over_time(lambda x: bernoulli_mean(continue_head(frozen, x, config)), features)
         if config.start_continue == "true":
             continue_[:, 0] = continue_target(batch["is_terminal"], config).flatten()
-        last = symexp_twohot_mean(critic(params, features[H], config), bins)
+        last = symexp_twohot_mean(critic(frozen, features[H], config), bins)
         value = torch.cat([symexp_twohot_mean(logits, bins), last.unsqueeze(1)], 1)
 
     # Returns.
@@ -155,8 +155,30 @@ def losses(
         "weight_mean": weight.mean(),
         "actor_entropy": entropy.detach().mean(),
     }
-    detached = {name: mean.detach() for name, mean in means.items()}
-    return total, {"losses": detached, "return_range": (low, high), **constants, "metrics": metrics}
+    return total, {"losses": means, "return_range": (low, high), **constants, "metrics": metrics}
+
+
+def _check(params: Params, batch: Observations, noise: Mapping[str, Tensor], spaces: Spaces, config: Config) -> tuple[int, int]:
+    """B and T, if everything has the names and shapes that belong to them. [CON-8] [CON-20]"""
+    flags = ("reward", "is_first", "is_last", "is_terminal")
+    steps = {key: space.array_shape for key, space in spaces.observations.items()} | dict.fromkeys(flags, ())
+    steps["prev_action"] = (spaces.action_size,)
+    expect_keys("batch", batch, (*steps, "deter", "stoch"))
+    expect_keys("noise", noise, ("posterior", "prior", "action"))
+    # Which of the arrays is the wrong one is what most of the others say.
+    (B, T), _ = Counter((*batch[name].shape, 0, 0)[:2] for name in steps).most_common(1)[0]
+    for name, shape in steps.items():
+        expect_shape(f"batch[{name!r}]", batch[name], (B, T, *shape))
+    expect_shape("batch['deter']", batch["deter"], (B, config.deter))
+    expect_shape("batch['stoch']", batch["stoch"], (B, config.stoch))
+    H, S, K = config.imagination_horizon, config.stoch, spaces.action_noise_size
+    for name, expected in {"posterior": (B, T, S), "prior": (B * T, H, S), "action": (B * T, H, K)}.items():
+        expect_shape(f"noise[{name!r}]", noise[name], expected)
+    table = parameter_table(config, spaces)
+    expect_keys("params", params, table)
+    for name, entry in table.items():
+        expect_shape(f"params[{name!r}]", params[name], entry.shape)
+    return B, T
 
 
 def _over_time(head: Callable[[Tensor], Tensor], features: list[Tensor]) -> Tensor:
@@ -197,6 +219,7 @@ def gradients(
     with torch.enable_grad():
         total, aux = losses(leaves, slow_critic, return_range, batch, noise, spaces, config)
         by_leaf: Iterable[Tensor] = torch.autograd.grad(total, list(leaves.values()), materialize_grads=True)
+    aux["losses"] = {name: loss.detach() for name, loss in aux["losses"].items()}
     return dict(zip(leaves, by_leaf, strict=True)), total.detach(), aux
 
 

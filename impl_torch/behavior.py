@@ -18,7 +18,7 @@ from impl_torch.distributions import (
     unimix_log_probs,
 )
 from impl_torch.networks import Outputs
-from impl_torch.shapes import expect_keys, expect_last, expect_same_shape, expect_shape, widen
+from impl_torch.shapes import expect_keys, expect_same_shape, expect_shape, widen
 from impl_torch.transforms import standard_bins
 from spec import Config, Spaces, Vector
 
@@ -29,9 +29,11 @@ Part = tuple[tuple[Tensor, ...], int, int]
 def _parts(outputs: Outputs, spaces: Spaces, config: Config) -> Iterator[Part]:
     """Per key in sorted order: mean and std [..., size] of a Vector, log-probabilities [..., classes] of each entry of a Discrete. [BEH-2] [BEH-4]"""
     expect_keys("outputs", outputs, spaces.actions, exactly=True)
+    leading = _leading(outputs)
     for key, space in spaces.actions.items():
+        expect_keys(f"outputs[{key!r}]", outputs[key], ("mean", "std") if isinstance(space, Vector) else ("logits",), exactly=True)
         for name, x in outputs[key].items():
-            expect_last(f"outputs[{key!r}][{name!r}]", x, space.encoded_size)
+            expect_shape(f"outputs[{key!r}][{name!r}]", x, (*leading, space.encoded_size))
         if isinstance(space, Vector):
             raw = outputs[key]
             yield bounded_normal(raw["mean"], raw["std"], config.actor_min_std, config.actor_max_std), space.size, space.size
@@ -82,6 +84,8 @@ def actor_loss(
     """-weight * (advantage * log_prob + entropy_scale * entropy): [N, H] five times -> [N, H]. [BEH-9] [BEH-10] [BEH-22] [BEH-23] [BEH-24]"""
     expect_same_shape(log_prob=log_prob, entropy=entropy, returns=returns, value=value, weight=weight)
     log_prob = widen(log_prob)
+    scale = torch.as_tensor(scale)
+    expect_shape("scale", scale, ())
     with torch.no_grad():
         advantage = (returns - value) / scale
     return -weight.detach() * (advantage * log_prob + config.entropy_scale * entropy)

@@ -22,6 +22,41 @@ TRUNCATED_STD = 0.8796256610342398  # of the standard normal cut at +-2
 CONVOLUTION_ROWS = 256
 
 
+NARROW = (torch.bfloat16, torch.float16)
+_WIDE_OUTPUT = tuple(int(part) for part in torch.__version__.split(".")[:2]) >= (2, 8)  # torch.mm and torch.bmm know out_dtype
+
+
+def wide_product(x: Tensor, y: Tensor) -> Tensor:
+    """x @ y, of two or three axes, in float32 or better whatever the dtype of x and y: for gradients of kernels. [CON-23]"""
+    if x.dtype not in NARROW:
+        return x @ y
+    if _WIDE_OUTPUT and x.device.type == "cuda":
+        return (torch.mm if x.ndim == 2 else torch.bmm)(x, y, out_dtype=torch.float32)
+    return x.float() @ y.float()
+
+
+class _NarrowProduct(torch.autograd.Function):
+    """A linear or block-linear layer in bfloat16 with float32 gradients of kernel and bias: autograd would round them to bfloat16.
+
+    x [G, N, in], kernel [G, in, out], bias [G, 1, out] or None.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, kernel: Tensor, bias: Tensor | None) -> Tensor:
+        narrow = kernel.to(x.dtype)
+        ctx.save_for_backward(x, narrow)
+        ctx.dtypes = kernel.dtype, None if bias is None else bias.dtype
+        return torch.bmm(x, narrow) if bias is None else torch.baddbmm(bias.to(x.dtype), x, narrow)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Any:  # type: ignore[override]
+        x, kernel = ctx.saved_tensors
+        kernel_dtype, bias_dtype = ctx.dtypes
+        by_x = torch.bmm(gradient, kernel.mT) if ctx.needs_input_grad[0] else None
+        by_bias = None if bias_dtype is None else gradient.sum(1, keepdim=True, dtype=torch.float32).to(bias_dtype)
+        return by_x, wide_product(x.mT, gradient).to(kernel_dtype), by_bias
+
+
 def _as_convolution(x: Tensor, rows: int) -> bool:
     return rows >= CONVOLUTION_ROWS and x.device.type == "cpu" and x.dtype == torch.float32 and torch.backends.mkldnn.is_available()
 
@@ -39,15 +74,17 @@ def linear(x: Tensor, kernel: Tensor, bias: Tensor | None) -> Tensor:
     """x @ kernel + bias over the last axis: [..., in], [in, out], [out] -> [..., out]. [LAY-1] [LAY-2] [LAY-15]"""
     expect(kernel.ndim == 2, "kernel", "shape [in, out]", list(kernel.shape))
     expect_last("x", x, kernel.shape[0])
-    kernel = kernel.to(x.dtype)
     if bias is not None:
         expect_shape("bias", bias, kernel.shape[1:])
-        bias = bias.to(x.dtype)
     rows = x.reshape(-1, x.shape[-1])
-    if _as_convolution(x, len(rows)):
-        y = _pointwise(rows, kernel.t(), bias, 1)
+    if x.dtype in NARROW:
+        y = _NarrowProduct.apply(rows[None], kernel[None], None if bias is None else bias[None, None])[0]
     else:
-        y = rows @ kernel if bias is None else torch.addmm(bias, rows, kernel)
+        kernel, bias = kernel.to(x.dtype), None if bias is None else bias.to(x.dtype)
+        if _as_convolution(x, len(rows)):
+            y = _pointwise(rows, kernel.t(), bias, 1)
+        else:
+            y = rows @ kernel if bias is None else torch.addmm(bias, rows, kernel)
     return y.view(*x.shape[:-1], kernel.shape[1])
 
 
@@ -56,16 +93,21 @@ def block_linear(x: Tensor, kernel: Tensor, bias: Tensor | None) -> Tensor:
     expect(kernel.ndim == 3, "kernel", "shape [G, in/G, out/G]", list(kernel.shape))
     blocks, inputs, outputs = kernel.shape
     expect_last("x", x, blocks * inputs)
-    kernel = kernel.to(x.dtype)
     if bias is not None:
         expect_shape("bias", bias, (blocks * outputs,))
-        bias = bias.to(x.dtype)
     rows = x.reshape(-1, blocks * inputs)
     if _as_convolution(x, len(rows)):
-        y = _pointwise(rows, kernel.transpose(1, 2).reshape(blocks * outputs, inputs), bias, blocks)
+        weight = kernel.to(x.dtype).transpose(1, 2).reshape(blocks * outputs, inputs)
+        y = _pointwise(rows, weight, None if bias is None else bias.to(x.dtype), blocks)
     else:
-        y = torch.bmm(rows.view(-1, blocks, inputs).transpose(0, 1), kernel).transpose(0, 1).reshape(-1, blocks * outputs)
-        y = y if bias is None else y + bias
+        by_block = rows.view(-1, blocks, inputs).transpose(0, 1)
+        bias = None if bias is None else bias.view(blocks, 1, outputs)
+        if x.dtype in NARROW:
+            y = _NarrowProduct.apply(by_block, kernel, bias)
+        else:
+            kernel = kernel.to(x.dtype)
+            y = torch.bmm(by_block, kernel) if bias is None else torch.baddbmm(bias.to(x.dtype), by_block, kernel)
+        y = y.transpose(0, 1).reshape(-1, blocks * outputs)
     return y.view(*x.shape[:-1], blocks * outputs)
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from impl_torch.agent import gradients, initial_parameters, policy_step
 from impl_torch.optimizer import flat_optimizer, flat_step_
 from impl_torch.parameters import Layout, Parameters
-from impl_torch.rssm import prepare
+from impl_torch.rssm import freeze
 from impl_torch.shapes import compute_dtype, wide_dtype
 from spec import Config, Discrete, Spaces, parameter_table
 
@@ -68,7 +68,7 @@ class Learner:
             "action": self._action_noise(generator, len(is_first)),
         }
         if self._acting is None:
-            self._acting = prepare({name: x.detach() for name, x in self.parameters.mapping().items()}, self.config)
+            self._acting = freeze(self.parameters.mapping(), self.config)
         inputs = {key: self._to_device(observation[key]) for key in self.spaces.observations}
         state, action = policy_step(self._acting, carry, carry["action"], inputs, self._to_device(is_first), noise, self.spaces, self.config)
         latents = {"deter": state["deter"].float().cpu().numpy(), "stoch": state["stoch"].argmax(-1).cpu().numpy()}

@@ -42,12 +42,13 @@ def feature(deter: Tensor, stoch: Tensor) -> Tensor:
 def encoder(params: Params, observations: Observations, spaces: Spaces, config: Config) -> Tensor:
     """Raw observations {key: [..., *array_shape]} -> tokens [..., E]. [NET-2] to [NET-12] [NET-24] [NET-26] [NET-27]"""
     check_observations(observations, spaces)
+    if spaces.images:
+        bottleneck(config, spaces)  # refuses sides that cannot be halved
     tokens = []
     if spaces.vectors:
         vector = torch.cat([encode_vector(observations[key], space, config) for key, space in spaces.vectors.items()], -1)
         tokens.append(mlp(params, "encoder/vector", vector.to(compute_dtype(config)), config.encoder_layers, config.norm_epsilon))
     if spaces.images:
-        bottleneck(config, spaces)  # refuses sides that cannot be halved
         image = torch.cat([observations[key] for key in spaces.images], -1)
         x = image.flatten(0, -4) if image.ndim > 3 else image.unsqueeze(0)
         x = _in_chunks(functools.partial(_encode_image, params, config=config), x, x.shape[1] * x.shape[2])
@@ -92,7 +93,7 @@ def _in_chunks(network: functools.partial[Tensor], x: Tensor, pixels: int) -> Te
 
 def _encode_image(params: Params, image: Tensor, config: Config) -> Tensor:
     """[N, H, W, channels] uint8 -> [N, h0*w0*c0]. [NET-6] to [NET-10] [LAY-14]"""
-    x = (image.to(wide_dtype(config)) / 255 - 0.5).to(compute_dtype(config))
+    x = ((image.to(wide_dtype(config)) - 127.5) / 255).to(compute_dtype(config))  # x/255 - 1/2 without the rounding of x/255
     for index in range(len(config.cnn_multipliers)):
         name = f"encoder/image/conv{index}"
         kernel, bias, scale = params[f"{name}/kernel"], params[f"{name}/bias"], params[f"{name}/scale"]

@@ -1,7 +1,7 @@
 """The recurrent state-space model. Chapter: spec/04-rssm.md.
 
-A state is {"deter" [N, D], "stoch" [N, S, C]}. Functions take the flat mapping of parameters; `prepare` casts and rearranges them once, which
-every function does for itself where its caller has not.
+A state is {"deter" [N, D], "stoch" [N, S, C]}. Functions take the flat mapping of parameters; `prepare` rearranges them once, which every
+function does for itself where its caller has not.
 """
 
 from collections.abc import Callable, Mapping
@@ -22,19 +22,23 @@ SHARED, BLOCK = "rssm/hidden/shared", "rssm/hidden/block"
 
 
 def prepare(params: Params, config: Config) -> Params:
-    """The parameters for many calls: kernels in the compute dtype, and those of rssm/hidden split in two. Doing it twice changes nothing.
+    """The parameters with the kernel of rssm/hidden split in two; doing it twice changes nothing.
 
     Every block of rssm/hidden reads its own memory and the same three embeddings ([RSSM-4]). For the embeddings the kernels of all blocks
     side by side make one dense product, instead of one over G copies of the embeddings.
     """
-    if SHARED in params:
+    if SHARED in params or "rssm/hidden/kernel" not in params:
         return params
+    own, shared = params["rssm/hidden/kernel"].split([config.deter // config.blocks, 3 * config.units], 1)
+    return {**params, BLOCK: own, SHARED: shared.transpose(0, 1).reshape(3 * config.units, config.deter)}
+
+
+def freeze(params: Params, config: Config) -> Params:
+    """`prepare`, as constants, with kernels in the compute dtype: for many calls without gradients."""
     dtype = compute_dtype(config)
-    prepared = {name: x.to(dtype) if name.endswith("/kernel") else x for name, x in params.items()}
-    if "rssm/hidden/kernel" in prepared:
-        own, shared = prepared["rssm/hidden/kernel"].split([config.deter // config.blocks, 3 * config.units], 1)
-        prepared[BLOCK], prepared[SHARED] = own, shared.transpose(0, 1).reshape(3 * config.units, config.deter)
-    return prepared
+    with torch.no_grad():
+        kernels = (*prepare(params, config).items(),)
+        return {name: x.detach().to(dtype) if x.ndim > 1 else x.detach() for name, x in kernels}
 
 
 def core(params: Params, deter: Tensor, stoch: Tensor, action: Tensor, config: Config) -> Tensor:
@@ -141,18 +145,18 @@ def observe(
     weights = ScanWeights(
         embed_deter=params["rssm/embed_deter/kernel"],
         embed_stoch=params["rssm/embed_stoch/kernel"],
-        embed_bias=torch.stack([params["rssm/embed_deter/bias"], params["rssm/embed_stoch/bias"]]).to(dtype),
+        embed_bias=torch.stack([params["rssm/embed_deter/bias"], params["rssm/embed_stoch/bias"]]),
         embed_scale=torch.stack([params["rssm/embed_deter/scale"], params["rssm/embed_stoch/scale"]]),
         shared=shared,
         block=params[BLOCK],
         hidden_scale=params["rssm/hidden/scale"],
         gru=params["rssm/gru/kernel"],
-        gru_bias=params["rssm/gru/bias"].to(dtype),
+        gru_bias=params["rssm/gru/bias"],
         out=params["rssm/posterior/out/kernel"],
-        out_bias=params["rssm/posterior/out/bias"].to(dtype),
+        out_bias=params["rssm/posterior/out/bias"],
         post_deter=post_deter,
         post_scale=params["rssm/posterior/hidden0/scale"],
-        deeper=tuple(_layer(params, f"rssm/posterior/hidden{layer}", dtype) for layer in range(1, config.posterior_layers)),
+        deeper=tuple(_layer(params, f"rssm/posterior/hidden{layer}") for layer in range(1, config.posterior_layers)),
     )
     start = torch.cat([deter, stoch.flatten(1)], -1).to(dtype).detach()
     options = ScanOptions(config.stoch, epsilon, config.latent_unimix)
@@ -161,8 +165,8 @@ def observe(
     return {"deter": deter, "stoch": stoch.unflatten(-1, (config.stoch, -1)), "logits": logits.transpose(0, 1)}
 
 
-def _layer(params: Params, name: str, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
-    return params[f"{name}/kernel"], params[f"{name}/bias"].to(dtype), params[f"{name}/scale"]
+def _layer(params: Params, name: str) -> tuple[Tensor, Tensor, Tensor]:
+    return params[f"{name}/kernel"], params[f"{name}/bias"], params[f"{name}/scale"]
 
 
 @torch.no_grad()

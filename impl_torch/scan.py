@@ -15,13 +15,13 @@ import torch
 from torch import Tensor
 
 from impl_torch.distributions import sample_onehot
-from impl_torch.layers import norm_silu_forward, normalize, silu_slope
+from impl_torch.layers import norm_silu_forward, normalize, silu_slope, wide_product
 from impl_torch.shapes import widen
 
 
 @dataclasses.dataclass(frozen=True)
 class ScanWeights:
-    """What the loop reads, in the compute dtype."""
+    """What the loop reads. It converts them to the compute dtype itself, so that their gradients are not rounded to it."""
 
     embed_deter: Tensor  # [D, d]
     embed_stoch: Tensor  # [Z, d]
@@ -77,6 +77,7 @@ class _Scan(torch.autograd.Function):
     def forward(
         ctx: Any, options: ScanOptions, carry: Tensor, is_first: Tensor, uniform: Tensor, action_drive: Tensor, token_drive: Tensor, *flat: Tensor
     ) -> Any:
+        flat = tuple(x.to(action_drive.dtype) for x in flat)
         w, epsilon = ScanWeights.from_flat(flat), options.epsilon
         T, B, D = action_drive.shape
         G, Z, S, units = len(w.block), w.out.shape[1], options.stoch, w.out.shape[0]
@@ -180,8 +181,7 @@ class _Scan(torch.autograd.Function):
             post_scale=scales[0],
             deeper=tuple(zip(kernels, biases, scales[1:], strict=True)),
         )
-        flat_gradients = [gradient.to(x.dtype) for gradient, x in zip(gradients.flat(), flat, strict=True)]
-        return None, None, None, None, by_hidden, by_post[0], *flat_gradients
+        return None, None, None, None, by_hidden, by_post[0], *gradients.flat()
 
 
 class _NormSiluBack:
@@ -221,12 +221,12 @@ def _gate_slopes(gates: Tensor, deter: Tensor) -> tuple[Tensor, Tensor]:
 
 def _product(x: Tensor, y: Tensor) -> Tensor:
     """The gradient of a kernel: x [T, B, in], y [T, B, out] -> [in, out]."""
-    return x.flatten(0, 1).t() @ y.flatten(0, 1)
+    return wide_product(x.flatten(0, 1).t(), y.flatten(0, 1))
 
 
 def _block_product(x: Tensor, y: Tensor) -> Tensor:
     """The same for every block: x [T, G, B, in/G], y [T, G, B, out/G] -> [G, in/G, out/G]."""
-    return x.permute(1, 3, 0, 2).flatten(2) @ y.transpose(0, 1).flatten(1, 2)
+    return wide_product(x.permute(1, 3, 0, 2).flatten(2), y.transpose(0, 1).flatten(1, 2))
 
 
 def _sum(y: Tensor) -> Tensor:

@@ -34,6 +34,7 @@ TWO = gym.Discrete(2)
         (gym.MultiBinary((2, 2)), Discrete((2, 2, 2, 2))),
     ],
 )
+@pytest.mark.covers("CON-28")
 def test_observation_spaces(space: gymnasium.Space, expected: object) -> None:
     assert translate(space, TWO).spaces.observations == {"observation": expected}
 
@@ -89,6 +90,7 @@ def test_every_kind_of_action_becomes_the_environments() -> None:
     assert action["move"].tolist() == [[0.0, 1.0]]
 
 
+@pytest.mark.covers("LOOP-12", "CON-27")
 def test_actions_agree_with_the_reference() -> None:
     low, high = np.float32([-3, 0, -np.inf, -np.inf, 0.5]), np.float32([1, 1e3, np.inf, 0.5, np.inf])
     translation = translate(TWO, gym.Dict({"a": gym.Discrete(3), "b": gym.Box(low, high), "c": gym.MultiDiscrete([2, 2])}))
@@ -138,6 +140,7 @@ def _records(processes: bool, steps: int = 11, action_repeat: int = 1) -> list[d
 
 
 @pytest.mark.parametrize("processes", [False, True])
+@pytest.mark.covers("LOOP-2", "LOOP-7", "LOOP-10", "LOOP-11", "CON-9", "CON-10", "CON-11")
 def test_each_observation_is_one_record(processes: bool) -> None:
     """Two episodes and the start of a third; the first terminates, the second is truncated. Nothing is lost, nothing comes twice."""
     stream = [{key: value[1] for key, value in record.items()} for record in _records(processes)]
@@ -149,6 +152,7 @@ def test_each_observation_is_one_record(processes: bool) -> None:
     assert stream[0]["reward"].dtype == np.float32
 
 
+@pytest.mark.covers("LOOP-5")
 def test_action_repeat_sums_rewards_and_stops_at_the_end() -> None:
     stream = [{key: value[0] for key, value in record.items()} for record in _records(False, steps=4, action_repeat=3)]
     assert [record["observation"][1] for record in stream] == [0, 3, 4, 0, 3]
@@ -190,6 +194,7 @@ def test_an_adapted_observation_is_a_copy() -> None:
     assert vector["observation"].tolist() == [0, 0]
 
 
+@pytest.mark.covers("LOOP-24")
 def test_seeds_decide_what_happens() -> None:
     def first(seeds: list[int]) -> list[list[float]]:
         envs = Environments(functools.partial(make_env, "gym:CartPole-v1"), 2, False)
@@ -201,6 +206,7 @@ def test_seeds_decide_what_happens() -> None:
     assert first([1, 2]) != first([1, 3])
 
 
+@pytest.mark.covers("LOOP-10", "CON-11")
 def test_a_time_limit_of_gymnasium_is_no_termination() -> None:
     envs = Environments(functools.partial(make_env, "gym:Pendulum-v1"), 1, False)
     envs.reset([0])

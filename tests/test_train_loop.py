@@ -67,6 +67,7 @@ def stored(state: Any) -> list[dict[str, np.ndarray]]:
 # What is stored
 
 
+@pytest.mark.covers("LOOP-2", "LOOP-3", "LOOP-6", "LOOP-7", "LOOP-9", "LOOP-10", "LOOP-11", "CON-9", "CON-10", "CON-11")
 def test_streams_hold_every_observation_with_what_arrived_with_it(make: Make) -> None:
     state = run_quietly(make(replay_ratio=0))
     streams = stored(state)
@@ -87,6 +88,7 @@ def test_streams_hold_every_observation_with_what_arrived_with_it(make: Make) ->
     assert np.abs(streams[0]["action"]).max() > 1, "the test needs actions that would be clipped"
 
 
+@pytest.mark.covers("LOOP-12", "CON-27")
 def test_the_environment_gets_clipped_and_scaled_actions() -> None:
     inner = train_fakes.Counting()
     env = setup.ContractEnv(inner, "t")
@@ -100,6 +102,7 @@ def test_the_environment_gets_clipped_and_scaled_actions() -> None:
 
 
 @pytest.mark.parametrize(("ratio", "envs"), [(0.7, 1), (6, 1), (6, 3), (7.3, 2), (32, 2)])
+@pytest.mark.covers("LOOP-13", "LOOP-14", "LOOP-15")
 def test_the_replay_ratio_is_exact(make: Make, ratio: float, envs: int) -> None:
     state = run_quietly(make(replay_ratio=ratio, envs=envs, steps=120))
     steps_together = SMALL["batch_length"] + -(-BATCH_STEPS // envs)
@@ -109,15 +112,35 @@ def test_the_replay_ratio_is_exact(make: Make, ratio: float, envs: int) -> None:
     assert len(batches()) == state.counters.train_steps == expected
 
 
+@pytest.mark.covers("LOOP-1", "LOOP-4")
+def test_training_runs_between_the_records_of_the_workers(make: Make) -> None:
+    """One policy step for all, then record by record as many train steps as are due: acting sees them all."""
+    with ExitStack() as stack:
+        state = setup.prepare(make(envs=3, steps=24, replay_ratio=BATCH_STEPS), FakeLearner, stack)
+        add = state.replay.add
+
+        def note(step: Any, worker: int) -> None:
+            FakeLearner.diary.append((str(worker), None))
+            add(step, worker)
+
+        state.replay.add = note  # type: ignore[method-assign]
+        loop.train(state)
+    order = "".join(kind[0] for kind, _ in FakeLearner.diary)
+    assert order == 4 * "p012" + "p012t" + 3 * "p0t1t2t"
+
+
+@pytest.mark.covers("LOOP-16")
 def test_no_training_with_ratio_zero(make: Make) -> None:
     assert run_quietly(make(replay_ratio=0)).counters.train_steps == 0
 
 
+@pytest.mark.covers("LOOP-5")
 def test_steps_count_action_repeat(make: Make) -> None:
     state = run_quietly(make(action_repeat=2, steps=60))
     assert (state.step, state.counters.records) == (60, 30)
 
 
+@pytest.mark.covers("LOOP-26")
 def test_draws_come_from_the_seed_and_the_train_step(make: Make) -> None:
     """The rows of a batch that the online queue does not fill are those that the specified numbers draw."""
     options = make(replay_ratio=BATCH_STEPS * 10, envs=1, steps=10)
@@ -130,6 +153,7 @@ def test_draws_come_from_the_seed_and_the_train_step(make: Make) -> None:
     assert time.tolist() == (starts + 1).tolist()
 
 
+@pytest.mark.covers("LOOP-17")
 def test_latents_are_written_back_before_the_next_draw(make: Make) -> None:
     state = run_quietly(make(replay_ratio=BATCH_STEPS * 5, envs=1, steps=200))
     seen = 0
@@ -147,6 +171,7 @@ def test_latents_are_written_back_before_the_next_draw(make: Make) -> None:
 # Evaluation
 
 
+@pytest.mark.covers("LOOP-18")
 def test_evaluation_plays_whole_episodes_and_changes_nothing(make: Make) -> None:
     def play(**given: Any) -> tuple[Any, list[dict[str, float]]]:
         state = run_quietly(make(**given))
@@ -165,6 +190,19 @@ def test_evaluation_plays_whole_episodes_and_changes_nothing(make: Make) -> None
     assert [stream["reward"].tolist() for stream in stored(state)] == [stream["reward"].tolist() for stream in stored(plain)]
 
 
+@pytest.mark.covers("LOOP-18", "LOOP-19", "LOOP-26")
+def test_evaluation_takes_no_random_numbers_from_training(make: Make) -> None:
+    """The agent acts in training as it would have acted without evaluations, and in these by the same policy."""
+    root = make().logdir
+    plain = stored(run_quietly(make(logdir=root / "plain", steps=40)))
+    alone = sum(kind == "policy" for kind, _ in FakeLearner.diary)
+    FakeLearner.diary.clear()
+    evaluated = stored(run_quietly(make(logdir=root / "evaluated", steps=40, eval_every=10, eval_episodes=2)))
+    assert sum(kind == "policy" for kind, _ in FakeLearner.diary) == alone + 3 * EPISODE
+    for stream, expected in zip(evaluated, plain, strict=True):
+        np.testing.assert_array_equal(stream["action"], expected["action"])
+
+
 def test_episodes_that_do_not_end_are_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(evaluation, "LONGEST_EPISODE", 50)
     envs = Environments(lambda index: make_env("train_fakes:Endless"), 1, False)
@@ -175,6 +213,7 @@ def test_episodes_that_do_not_end_are_an_error(monkeypatch: pytest.MonkeyPatch) 
 # Logs
 
 
+@pytest.mark.covers("LOOP-20")
 def test_metrics_curve_and_last_words(make: Make, capsys: pytest.CaptureFixture[str]) -> None:
     options = make(eval_episodes=2, random_episodes=2)
     assert loop.run(options, FakeLearner)
@@ -202,6 +241,7 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_spares_the_checkpoint(make:
 # Checkpoints
 
 
+@pytest.mark.covers("LOOP-21", "LOOP-23")
 def test_a_resumed_run_goes_on_where_it_stopped(make: Make) -> None:
     whole = run_quietly(make(steps=120, logdir=make().logdir / "whole"))
     with ExitStack() as stack:
@@ -259,6 +299,7 @@ def test_another_backend_may_continue(make: Make, capsys: pytest.CaptureFixture[
     assert "which jax has trained so far" in capsys.readouterr().out
 
 
+@pytest.mark.covers("LOOP-21")
 def test_another_configuration_is_refused_with_all_differences(make: Make) -> None:
     loop.run(make(), FakeLearner)
     other = make(seed=1, learning_rate=1e-3, task="train_fakes:nan_observation")
@@ -292,6 +333,7 @@ def test_resume_never_and_must(make: Make, resume: str) -> None:
         loop.run(make(resume=resume), FakeLearner)
 
 
+@pytest.mark.covers("LOOP-22")
 def test_a_checkpoint_is_complete_or_absent(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     loop.run(make(), FakeLearner)
     before = checkpoint.find(make().logdir)
@@ -334,6 +376,7 @@ def test_the_first_interrupt_saves(make: Make, monkeypatch: pytest.MonkeyPatch) 
     assert signal.getsignal(signal.SIGINT) is handler
 
 
+@pytest.mark.covers("LOOP-24")
 def test_the_same_seed_gives_the_same_run(make: Make) -> None:
     first = stored(run_quietly(make(logdir=make().logdir / "a", task="gym:CartPole-v1")))
     again = stored(run_quietly(make(logdir=make().logdir / "b", task="gym:CartPole-v1")))

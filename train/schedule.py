@@ -77,7 +77,7 @@ def mean_metrics(run: Run) -> dict[str, float]:
       UserError: a loss is not finite.
     """
     taken, run.metrics = run.metrics, []
-    means = {name: float(np.mean([np.asarray(entry[name]) for entry in taken])) for name in (taken[0] if taken else ())}
+    means = {name: float(np.mean([float(entry[name]) for entry in taken])) for name in (taken[0] if taken else ())}
     _require_finite(run, means)
     return {f"train/{name}": value for name, value in means.items()}
 
@@ -124,7 +124,7 @@ def save(run: Run) -> Path:
     """
     write_back(run)
     for metrics in run.metrics[-1:]:
-        _require_finite(run, {name: float(np.asarray(value)) for name, value in metrics.items()})
+        _require_finite(run, {name: float(value) for name, value in metrics.items()})
     info = {
         "identity": run.options.identity(),
         "spaces": run.envs.spaces.to_json(),
@@ -139,6 +139,8 @@ def save(run: Run) -> Path:
 
 def finish(run: Run) -> None:
     """The last evaluation, the last checkpoint, the picture, and what came of it all."""
+    if run.metrics:
+        run.logger.write(run.step, run.counters.seconds, mean_metrics(run))
     if run.evaluation is None or run.evaluation["step"] != run.step:
         run_evaluation(run)
         save(run)

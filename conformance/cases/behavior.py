@@ -16,7 +16,7 @@ from spec import Config, Discrete, Spaces, Vector
 
 # Numbers in the chapter have seven digits; in bfloat16 already the rounded inputs move the results by a percent.
 LITERAL = {"float64": 1e-6, "float32": 4e-6, "bfloat16": 3e-2}
-LEADING = st.sampled_from([(), (4,), (2, 3)])
+LEADING = st.sampled_from([(), (2, 3)])
 # Given unsorted; in sorted order Aim, buttons, one, turn: 1 + 5 + 1 + 2 numbers in a flat action, 1 + 2 + 1 + 2 in its noise.
 TASK = Spaces({"x": Vector(1)}, {"turn": Vector(2), "buttons": Discrete((2, 3)), "one": Discrete((1,)), "Aim": Vector(1)})
 DISCRETE = Spaces({"x": Vector(1)}, {"action": Discrete((2,))})

@@ -16,8 +16,8 @@ from reference_numpy.transforms import symlog
 
 # Numbers in the chapter have seven digits; in bfloat16 already the rounded inputs move the results by a percent.
 LITERAL = {"float64": 1e-6, "float32": 4e-6, "bfloat16": 3e-2}
-LEADING = st.sampled_from([(), (4,), (2, 3)])
-CATEGORICAL = st.sampled_from([(5,), (3, 1), (4, 2), (2, 3, 64)])
+LEADING = st.sampled_from([(), (2, 3)])
+CATEGORICAL = st.sampled_from([(5,), (3, 1), (2, 3, 64)])
 LOGITS = st.one_of(st.floats(-20, 20, width=32), st.sampled_from([0.0, -0.0, 1e-45, 100.0, -1e4, 1e30, -1e30, -math.inf]))
 # Small, so that no result is near the edge of a precision, where float32 may and may not overflow.
 FINITE = st.one_of(st.floats(-1e4, 1e4, width=32), st.floats(-3, 3, width=32), st.sampled_from([0.0, -0.0, 1e-45, 1e-20, 1e9]))
@@ -301,8 +301,10 @@ def bernoulli_matches(run: Run) -> None:
         mean = reference.bernoulli_mean(logit)
         run.expect("bernoulli_mean", (logit,), mean, magnitude=size * np.nan_to_num(mean) + run.tiny / run.u, bound=run.u)
 
-    # Where softplus is not yet the identity in float64, and where the logarithm of a computed sigmoid has lost its digits.
+    # Where softplus is not yet the identity in float64, and where a sigmoid made of tanh, or its logarithm, has lost its digits.
     logit = run.cast(np.concatenate([np.arange(-40, 41), [-200, 200]]))
+    mean = reference.bernoulli_mean(logit)
+    run.expect("bernoulli_mean", (logit,), mean, magnitude=16 * (1 + np.abs(logit)) * mean + run.tiny / run.u, bound=run.u)
     for share in (0.0, 0.5, 1.0):
         expected = reference.bernoulli_loss(logit, np.full(logit.shape, share))
         magnitude = 16 * (1 + np.abs(logit)) * expected + 16

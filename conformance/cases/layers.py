@@ -12,7 +12,7 @@ from reference_numpy import layers as reference
 from reference_numpy import networks
 from spec import Image, Spaces, Vector, parameter_table
 
-LEADING = st.sampled_from([(), (3,), (2, 3)])
+LEADING = st.sampled_from([(), (2, 3)])
 SUMS = ("linear", "block_linear", "convolution", "transposed_convolution")
 SCALES = st.sampled_from([1e-3, 1.0, 300.0])
 # Numbers in the chapter have seven digits.
@@ -422,9 +422,8 @@ def rows_do_not_mix(run: Run) -> None:
         ("upsample", image, ()),
     )
     for function, array, others in cases:
-        before = np.asarray(run.call(function, array, *others), np.float64)
+        expected = np.array(run.call(function, array, *others), np.float64)
         spoiled = array.copy()
         spoiled[1, 1] = np.nan
-        after = np.asarray(run.call(function, spoiled, *others), np.float64)
-        before[1, 1] = np.nan
-        run.exact(function, after, before)
+        expected[1, 1] = np.nan
+        run.exact(function, run.call(function, spoiled, *others), expected)
