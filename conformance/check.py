@@ -143,13 +143,15 @@ class Run:
             self.worst = Worst(math.inf, math.inf, where)
             raise Deviation(f"{where} does not hold")
 
-    def refuses(self, function: str, *args: Any) -> None:
-        """Raises `Deviation` unless the candidate raises a ValueError with a message."""
+    def refuses(self, function: str, *args: Any, naming: Iterable[str] = ()) -> None:
+        """Raises `Deviation` unless the candidate raises a ValueError with a message; `naming` are words that it must hold."""
         self.compared += 1
         try:
             result = self.call(function, *args)
         except ValueError as error:
             self.holds(f"the error message of {function}", bool(str(error)))
+            for word in naming:
+                self.holds(f"the error message of {function} names {word!r} ({_brief(str(error))})", word in str(error))
             return
         self.worst = Worst(math.inf, math.inf, function)
         raise Deviation(f"{function} must raise a ValueError for {_brief(args)}, and returned {_brief(result)}")

@@ -3,6 +3,7 @@
 import argparse
 import importlib
 import sys
+import textwrap
 from collections.abc import Sequence
 
 from rich.console import Console
@@ -101,10 +102,11 @@ def _coverage(console: Console, options: argparse.Namespace) -> int:
     view = Table()
     columns = (*COLUMNS, "tests")
     for column in ("requirement", *columns, "text"):
-        view.add_column(column, no_wrap=column == "text", overflow="ellipsis" if column == "text" else "fold")
+        view.add_column(column, min_width=len(column))
     for requirement, covering in table.items():
         counts = (str(len(covering[column])) if column in covering else "-" for column in columns)
-        view.add_row(requirement, *counts, requirements()[requirement].replace("[", r"\["))
+        text = textwrap.shorten(requirements()[requirement], 80, placeholder=" ...")
+        view.add_row(requirement, *counts, text.replace("[", r"\["))
     console.print(view)
     for problem in problems:
         console.print(f"[bold red]{problem}")

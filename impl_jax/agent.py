@@ -1,5 +1,6 @@
 """The agent: parameters, training state, policy step, losses and train step. Chapter: spec/10-agent.md."""
 
+import statistics
 from collections.abc import Mapping
 from typing import Any
 
@@ -15,7 +16,7 @@ from impl_jax.layers import Params, exact_dtype, truncated_normal
 from impl_jax.optimizer import initial_optimizer_state, optimizer_step_with_metrics
 from impl_jax.transforms import exponential_bins, real
 from impl_jax.world_model import continue_target, world_model_losses
-from spec import Config, Parameter, Spaces
+from spec import Config, Parameter, Spaces, parameter_table
 
 Arrays = Mapping[str, jax.Array]
 State = dict[str, Any]
@@ -61,6 +62,15 @@ def policy_step(
 
     carry: {"deter" [N, D], "stoch" [N, S, C]}; prev_action [N, A]; noise {"posterior" [N, S], "action" [N, K]}.
     """
+    _check_parameters(params, spaces, config)
+    require_shape("is_first", is_first, "N")
+    N = is_first.shape[0]
+    require_shape("carry deter", carry["deter"], N, config.deter)
+    require_shape("carry stoch", carry["stoch"], N, config.stoch, config.classes)
+    require_shape("prev_action", prev_action, N, spaces.action_size)
+    require_shape("noise posterior", noise["posterior"], N, config.stoch)
+    require_shape("noise action", noise["action"], N, spaces.action_noise_size)
+    _check_observations(observation, (N,), spaces)
     tokens = networks.encoder(params, observation, spaces, config)
     carry, _ = rssm.observe_step(params, carry, tokens, prev_action, is_first, noise["posterior"], config)
     outputs = networks.actor(params, networks.feature(carry["deter"], carry["stoch"]), spaces, config)
@@ -84,22 +94,56 @@ def losses(
       total: scalar.
       aux: "losses" (name -> unweighted mean), "return_range" (updated), "deter" [B, T, D] and "stoch" [B, T, S, C] (constants), "metrics".
     """
-    slow_critic, return_range, batch, noise = stop_gradient((dict(slow_critic), tuple(return_range), dict(batch), dict(noise)))
+    _check_parameters(params, spaces, config)
+    _check_parameters(slow_critic, spaces, config)
+    _check_batch(batch, noise, spaces, config)
+    slow_critic, batch, noise = stop_gradient((dict(slow_critic), dict(batch), dict(noise)))
+    low, high = (stop_gradient(jnp.asarray(end)) for end in return_range)
     states = _observe_batch(params, batch, noise["posterior"], spaces, config)
     each = world_model_losses(params, batch, states, spaces, config)
-    behavior_losses, updated_range, metrics = _behavior_losses(params, slow_critic, return_range, batch, states, noise, spaces, config)
+    behavior_losses, updated_range, metrics = _behavior_losses(params, slow_critic, (low, high), batch, states, noise, spaces, config)
     each |= behavior_losses
     means = {name: jnp.mean(loss) if loss.size else jnp.zeros((), loss.dtype) for name, loss in each.items()}
     total = jnp.asarray(sum(getattr(config, f"{name.split('/')[0]}_scale") * mean for name, mean in means.items()))
     latents = {"deter": states["deter"], "stoch": states["stoch"]}
-    return total, stop_gradient({"losses": means, "return_range": updated_range, **latents, "metrics": metrics})
+    return total, {"losses": means} | stop_gradient({"return_range": updated_range, **latents, "metrics": metrics})
+
+
+def _check_parameters(params: Params, spaces: Spaces, config: Config) -> None:
+    """Raises ValueError where a parameter has not the shape of the table. [CON-8], [AGT-1]"""
+    for name, entry in parameter_table(config, spaces).items():
+        if name in params:
+            require_shape(f"parameter {name}", params[name], *entry.shape)
+
+
+def _check_observations(observations: Arrays, leading: tuple[int, ...], spaces: Spaces) -> None:
+    for key, space in spaces.observations.items():
+        require(key in observations, "observations", f"the key {key!r}", f"the keys {sorted(observations)}")
+        require_shape(f"observation {key!r}", observations[key], *leading, *space.array_shape)
+
+
+def _check_batch(batch: Arrays, noise: Arrays, spaces: Spaces, config: Config) -> None:
+    """Raises ValueError where an array of a train step has a wrong shape. [CON-8], [CON-20]"""
+    flags = ("reward", "is_first", "is_last", "is_terminal")
+    for key in (*flags, "prev_action", "deter", "stoch"):
+        require(key in batch, "batch", f"the key {key!r}", f"the keys {sorted(batch)}")
+    # Sequences and steps are what most entries say, so that the error names the one that differs.
+    B, T = statistics.mode(batch[key].shape for key in flags if batch[key].ndim == 2)
+    for key in flags:
+        require_shape(f"batch {key}", batch[key], B, T)
+    require_shape("batch prev_action", batch["prev_action"], B, T, spaces.action_size)
+    require_shape("batch deter", batch["deter"], B, config.deter)
+    require_shape("batch stoch", batch["stoch"], B, config.stoch)
+    _check_observations(batch, (B, T), spaces)
+    H = config.imagination_horizon
+    shapes = {"posterior": (B, T, config.stoch), "prior": (B * T, H, config.stoch), "action": (B * T, H, spaces.action_noise_size)}
+    for key, shape in shapes.items():
+        require(key in noise, "noise", f"the key {key!r}", f"the keys {sorted(noise)}")
+        require_shape(f"noise {key}", noise[key], *shape)
 
 
 def _observe_batch(params: Params, batch: Arrays, uniform: jax.Array, spaces: Spaces, config: Config) -> dict[str, jax.Array]:
     """The posterior states of a train batch, from the stored latents of the context step. [AGT-14], [AGT-15]"""
-    B = batch["is_first"].shape[0]
-    require_shape("batch deter", batch["deter"], B, config.deter)
-    require_shape("batch stoch", batch["stoch"], B, config.stoch)
     tokens = networks.encoder(params, batch, spaces, config)
     carry = {"deter": batch["deter"], "stoch": jax.nn.one_hot(batch["stoch"], config.classes, dtype=jnp.float32)}
     return rssm.observe(params, carry, tokens, batch["prev_action"], batch["is_first"], uniform, config)
@@ -115,7 +159,7 @@ def _behavior_losses(
     spaces: Spaces,
     config: Config,
 ) -> tuple[dict[str, jax.Array], tuple[jax.Array, jax.Array], dict[str, jax.Array]]:
-    """Losses of actor and critic, the updated return range, and metrics. Arrays of imagination have time first here. [AGT-17] to [AGT-25]"""
+    """Losses of actor and critic, the updated return range, and metrics; imagined arrays have time first. [AGT-17] to [AGT-25]"""
     B, T = batch["is_first"].shape
     exact, bins = exact_dtype(config), exponential_bins(config.bins)
     constants = stop_gradient(dict(params))
@@ -166,14 +210,9 @@ def _behavior_losses(
     return each, updated_range, metrics
 
 
-def _imagine_batch(
-    constants: Params, states: Arrays, noise: Arrays, spaces: Spaces, config: Config
-) -> tuple[jax.Array, jax.Array]:
+def _imagine_batch(constants: Params, states: Arrays, noise: Arrays, spaces: Spaces, config: Config) -> tuple[jax.Array, jax.Array]:
     """Features [H+1, N, F] and actions [H, N, A] of imagination from every posterior state. [AGT-17], [AGT-18]"""
     N = states["deter"].shape[0] * states["deter"].shape[1]
-    H = config.imagination_horizon
-    require_shape("noise prior", noise["prior"], N, H, config.stoch)
-    require_shape("noise action", noise["action"], N, H, spaces.action_noise_size)
     carry = stop_gradient({key: states[key].reshape(N, *states[key].shape[2:]) for key in ("deter", "stoch")})
     uniform, action_noise = (noise[key].swapaxes(0, 1) for key in ("prior", "action"))
 

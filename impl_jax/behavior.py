@@ -4,7 +4,9 @@ The losses are elementwise and not weighted by their scales [BEH-17]; they accep
 keep time first.
 """
 
+import functools
 from collections.abc import Iterator, Mapping
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -45,21 +47,53 @@ def _check_outputs(outputs: Outputs, spaces: Spaces) -> tuple[int, ...]:
     return leading
 
 
-def _distributions(outputs: Outputs, spaces: Spaces, config: Config) -> Iterator[tuple[bool, int, int, tuple[jax.Array, ...]]]:
-    """The independent parts of the policy in flat order: (is categorical, length in the action, length in the noise, parameters).
+class _Categorical(NamedTuple):
+    """One entry of a Discrete. [BEH-2]"""
 
-    A categorical has its log-probabilities, a vector of normals mean and standard deviation. [BEH-2], [BEH-4], [BEH-22]
-    """
+    log_probs: jax.Array
+    length: int  # in the flat action
+    noise: int = 1
+
+    def sample(self, noise: jax.Array) -> jax.Array:
+        return categorical_sample(self.log_probs, noise[..., 0])
+
+    def log_prob(self, action: jax.Array) -> jax.Array:
+        return categorical_log_prob(self.log_probs, action)
+
+    def entropy(self) -> jax.Array:
+        return categorical_entropy(self.log_probs)
+
+
+class _Normals(NamedTuple):
+    """All dimensions of a Vector. [BEH-4]"""
+
+    mean: jax.Array
+    std: jax.Array
+    length: int
+    noise: int
+
+    def sample(self, noise: jax.Array) -> jax.Array:
+        return normal_sample(self.mean, self.std, noise)
+
+    def log_prob(self, action: jax.Array) -> jax.Array:
+        return jnp.sum(normal_log_prob(self.mean, self.std, action), -1)
+
+    def entropy(self) -> jax.Array:
+        return jnp.sum(normal_entropy(self.std), -1)
+
+
+def _distributions(outputs: Outputs, spaces: Spaces, config: Config) -> Iterator[_Categorical | _Normals]:
+    """The independent parts of the policy, in the order of the flat action. [BEH-22]"""
     for key, space in spaces.actions.items():
         if isinstance(space, Discrete):
             start = 0
             for classes in space.classes:
                 segment = outputs[key]["logits"][..., start : start + classes]
-                yield True, classes, 1, (unimix_log_probs(segment, config.actor_unimix),)
+                yield _Categorical(unimix_log_probs(segment, config.actor_unimix), classes)
                 start += classes
         else:
             mean, std = outputs[key]["mean"], outputs[key]["std"]
-            yield False, space.size, space.size, bounded_normal(mean, std, config.actor_min_std, config.actor_max_std)
+            yield _Normals(*bounded_normal(mean, std, config.actor_min_std, config.actor_max_std), space.size, space.size)
 
 
 def sample_action(outputs: Outputs, noise: jax.Array, spaces: Spaces, config: Config) -> jax.Array:
@@ -67,10 +101,9 @@ def sample_action(outputs: Outputs, noise: jax.Array, spaces: Spaces, config: Co
     leading = _check_outputs(outputs, spaces)
     require_shape("noise", noise, *leading, spaces.action_noise_size)
     actions, start = [], 0
-    for categorical, _, count, parameters in _distributions(outputs, spaces, config):
-        part = noise[..., start : start + count]
-        actions.append(categorical_sample(*parameters, part[..., 0]) if categorical else normal_sample(*parameters, part))
-        start += count
+    for part in _distributions(outputs, spaces, config):
+        actions.append(part.sample(noise[..., start : start + part.noise]))
+        start += part.noise
     return jnp.concatenate(actions, -1)
 
 
@@ -79,22 +112,16 @@ def action_log_prob(outputs: Outputs, action: jax.Array, spaces: Spaces, config:
     leading = _check_outputs(outputs, spaces)
     require_shape("action", action, *leading, spaces.action_size)
     total, start = [], 0
-    for categorical, length, _, parameters in _distributions(outputs, spaces, config):
-        part = action[..., start : start + length]
-        log_prob = categorical_log_prob(*parameters, part) if categorical else jnp.sum(normal_log_prob(*parameters, part), -1)
-        total.append(log_prob)
-        start += length
-    return sum(total[1:], start=total[0])
+    for part in _distributions(outputs, spaces, config):
+        total.append(part.log_prob(action[..., start : start + part.length]))
+        start += part.length
+    return functools.reduce(jnp.add, total)
 
 
 def action_entropy(outputs: Outputs, spaces: Spaces, config: Config) -> jax.Array:
     """The entropy of the policy, summed over everything: [...], nats. [BEH-7]"""
     _check_outputs(outputs, spaces)
-    total = [
-        categorical_entropy(*parameters) if categorical else jnp.sum(normal_entropy(parameters[1]), -1)
-        for categorical, _, _, parameters in _distributions(outputs, spaces, config)
-    ]
-    return sum(total[1:], start=total[0])
+    return functools.reduce(jnp.add, [part.entropy() for part in _distributions(outputs, spaces, config)])
 
 
 def actor_loss(
@@ -129,9 +156,7 @@ def critic_loss(logits: jax.Array, slow_logits: jax.Array, returns: jax.Array, w
     return stop_gradient(real(weight)) * _value_loss(logits, slow_logits, returns, config)
 
 
-def replay_critic_loss(
-    logits: jax.Array, slow_logits: jax.Array, returns: jax.Array, is_last: jax.Array, config: Config
-) -> jax.Array:
+def replay_critic_loss(logits: jax.Array, slow_logits: jax.Array, returns: jax.Array, is_last: jax.Array, config: Config) -> jax.Array:
     """The critic's loss on replayed steps 0 .. T-2: [B, T-1, bins] twice and [B, T-1] twice -> [B, T-1]. [BEH-14], [BEH-15]"""
     require_same_shape(returns=returns, is_last=is_last)
     loss = _value_loss(logits, slow_logits, returns, config)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import lax
 
 _NHWC = ("NHWC", "HWIO", "NHWC")
-_PATCH_BYTES = 3 << 20  # per chunk of images: a share of a core's cache
+_PATCH_BYTES = 12 << 20  # for a chunk of images: a share of the last cache
 _THIN = 8  # channels below which copying patches costs more than multiplying them
 
 
@@ -80,16 +80,15 @@ def _patches(x: jax.Array, size: int, stride: int) -> jax.Array:
     return x.reshape(n * rows * columns, size * size * channels)
 
 
-def _chunk(images: int, patch_numbers: int, itemsize: int) -> int:
-    """How many images to take at a time: the largest divisor of their number whose patches fit."""
-    most = max(1, _PATCH_BYTES // (patch_numbers * itemsize))
-    return max(divisor for divisor in range(1, min(images, most) + 1) if images % divisor == 0)
+def divisor(count: int, most: int) -> int:
+    """The largest divisor of `count` that is at most `most`, and at least 1."""
+    return next(d for d in range(max(1, min(count, most)), 0, -1) if count % d == 0)
 
 
 def _by_chunks(function: Callable[[jax.Array], jax.Array], x: jax.Array, patch_numbers: int) -> jax.Array:
     """`function` on a few images at a time."""
     images = x.shape[0]
-    chunk = _chunk(images, patch_numbers, x.dtype.itemsize)
+    chunk = divisor(images, _PATCH_BYTES // (patch_numbers * x.dtype.itemsize))
     if chunk == images:
         return function(x)
     y = lax.map(function, x.reshape(images // chunk, chunk, *x.shape[1:]))
@@ -107,11 +106,13 @@ def _correlate_cpu(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:
 
     def thin(x: jax.Array) -> jax.Array:
         """For a few output channels the other way round: multiply first, then add up shifted planes."""
-        planes = jnp.einsum("klio,nhwi->nklohw", kernel, x, precision=precision(x.dtype))
+        wide = jnp.promote_types(x.dtype, jnp.float32)
+        planes = jnp.einsum("klio,nhwi->nklohw", kernel, x, precision=precision(x.dtype), preferred_element_type=wide)
         edge = size // 2
         planes = jnp.pad(planes, ((0, 0),) * 4 + ((edge, edge), (edge, edge)))
         taps = [(row, column) for row in range(size) for column in range(size)]
-        return sum(planes[:, r, c, :, r : r + height, c : c + width] for r, c in taps).transpose(0, 2, 3, 1)
+        shifted = (planes[:, r, c, :, r : r + height, c : c + width] for r, c in taps)
+        return functools.reduce(jnp.add, shifted).transpose(0, 2, 3, 1).astype(x.dtype)
 
     is_thin = stride == 1 and outputs < _THIN <= inputs
     patch_numbers = height * width * size * size * (outputs if is_thin else inputs)
@@ -158,9 +159,9 @@ def _kernel_gradient_cpu(x: jax.Array, g: jax.Array, size: int, stride: int) -> 
     inputs, outputs, images = x.shape[3], g.shape[3], x.shape[0]
     dtype = jnp.promote_types(x.dtype, jnp.float32)
     numbers = g.shape[1] * g.shape[2] * size * size * inputs
-    chunk = _chunk(images, numbers, x.dtype.itemsize)
+    chunk = divisor(images, _PATCH_BYTES // (numbers * x.dtype.itemsize))
 
-    def add(total: jax.Array, pair: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
+    def add(total: jax.Array, pair: tuple[jax.Array, ...]) -> tuple[jax.Array, None]:
         patches, g = _patches(pair[0], size, stride), pair[1].reshape(-1, outputs)
         product = lax.dot_general(patches, g, (((0,), (0,)), ((), ())), precision=precision(x.dtype), preferred_element_type=dtype)
         return total + product, None

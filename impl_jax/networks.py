@@ -25,6 +25,7 @@ from impl_jax.layers import (
 )
 from impl_jax.transforms import symlog
 from spec import Config, Discrete, Image, Spaces, Vector
+from spec.parameters import bottleneck
 
 Observations = Mapping[str, jax.Array]
 
@@ -42,6 +43,8 @@ def encoder(params: Params, observations: Observations, spaces: Spaces, config: 
       ValueError: a missing key, or an observation of the wrong shape or dtype. [NET-27]
     """
     leading = _leading_axes(observations, spaces)
+    if spaces.images:
+        bottleneck(config, spaces)  # refuses sides that cannot be halved, before any network runs
     tokens = []
     if spaces.vectors:
         x = jnp.concatenate([_vector_input(observations[key], space, config) for key, space in spaces.vectors.items()], -1)
@@ -101,7 +104,7 @@ def _image_encoder(params: Params, x: jax.Array, config: Config) -> jax.Array:
 def decoder(params: Params, feature: jax.Array, spaces: Spaces, config: Config) -> dict[str, jax.Array]:
     """Reconstructions from features [..., F]: key -> symlog vectors, logits, or images in [0, 1]. [NET-13] to [NET-19]"""
     x = _feature_input(feature, config)
-    result = {}
+    result: dict[str, jax.Array] = {}
     if spaces.vectors:
         hidden = mlp(params, "decoder/vector", x, config.decoder_layers, config.norm_epsilon)
         result |= {key: _output(params, f"decoder/vector/out/{key}", hidden, config) for key in spaces.vectors}
@@ -117,8 +120,7 @@ def decoder(params: Params, feature: jax.Array, spaces: Spaces, config: Config) 
 
 def _image_decoder(params: Params, x: jax.Array, spaces: Spaces, config: Config) -> jax.Array:
     """Features [n, F] -> [n, H, W, image channels] in [0, 1]. [NET-15] to [NET-18]"""
-    image = next(iter(spaces.images.values()))
-    height, width = image.height // 2**config.halvings, image.width // 2**config.halvings
+    height, width, _ = bottleneck(config, spaces)
     deter, stoch = x[:, : config.deter], x[:, config.deter :]
 
     from_deter = block_linear(deter, params["decoder/image/deter/kernel"], params["decoder/image/deter/bias"])

@@ -174,12 +174,13 @@ def scale_by_laprop(beta1: float = 0.9, beta2: float = 0.99, epsilon: float = 1e
         return LaPropState(jnp.zeros((), jnp.int32), zeros(), zeros())
 
     def update(updates: optax.Updates, state: LaPropState, params: optax.Params | None = None) -> tuple[optax.Updates, LaPropState]:
-        leaves, tree = jax.tree.flatten(updates)
-        moments = zip(leaves, tree.flatten_up_to(state.second_moment), tree.flatten_up_to(state.momentum), strict=True)
-        results = [_laprop(real(g), v, m, state.step, beta1, beta2, epsilon) for g, v, m in moments]
-        scaled = [result[0].astype(leaf.dtype) for result, leaf in zip(results, leaves, strict=True)]
-        second_moment, momentum = (tree.unflatten([result[index] for result in results]) for index in (1, 2))
-        return tree.unflatten(scaled), LaPropState(state.step + 1, second_moment, momentum)
+        gradients = jax.tree.map(real, updates)
+        results = jax.tree.map(
+            lambda g, v, m: _laprop(g, v, m, state.step, beta1, beta2, epsilon), gradients, state.second_moment, state.momentum
+        )
+        scaled, second_moment, momentum = jax.tree.transpose(jax.tree.structure(updates), jax.tree.structure((0, 0, 0)), results)
+        scaled = jax.tree.map(lambda update, like: update.astype(like.dtype), scaled, updates)
+        return scaled, LaPropState(state.step + 1, second_moment, momentum)
 
     return optax.GradientTransformation(init, update)
 

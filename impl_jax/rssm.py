@@ -84,7 +84,9 @@ def _embed_action(params: Params, action: jax.Array, config: Config) -> jax.Arra
 def _core_step(apply: Apply, scales: Arrays, deter: jax.Array, stoch: jax.Array, action: jax.Array, config: Config) -> jax.Array:
     """deter [G, N, D/G], flat stoch [N, S*C], embedded action [N, d] -> deter [G, N, D/G]. [RSSM-3] to [RSSM-7]"""
     epsilon = config.norm_epsilon
-    embedded = [activate(apply(name, x), scales[name], epsilon) for name, x in (("embed_deter", from_blocks(deter)), ("embed_stoch", stoch))]
+    embedded = [
+        activate(apply(name, x), scales[name], epsilon) for name, x in (("embed_deter", from_blocks(deter)), ("embed_stoch", stoch))
+    ]
     shared = apply("hidden_shared", jnp.concatenate([*embedded, action], -1))
     hidden = apply("hidden_block", deter) + to_blocks(shared, config.blocks)
     hidden = silu(rms_norm_over(hidden, scales["hidden"].reshape(config.blocks, 1, -1), epsilon, (0, 2)))
@@ -136,7 +138,7 @@ def _logits(x: jax.Array, config: Config) -> jax.Array:
 
 
 def _sample(logits: jax.Array, uniform: jax.Array, config: Config) -> jax.Array:
-    """A straight-through sample of all latents: [..., S, C], [..., S] -> [..., S, C] in the compute dtype. [RSSM-11], [RSSM-12], [RSSM-26]"""
+    """A straight-through sample of all latents: [..., S, C] in the compute dtype. [RSSM-11], [RSSM-12], [RSSM-26]"""
     log_probs = unimix_log_probs(logits, config.latent_unimix)
     return straight_through(log_probs, categorical_sample(log_probs, uniform)).astype(compute_dtype(config))
 
@@ -156,7 +158,12 @@ def observe_step(
     config: Config,
 ) -> tuple[Arrays, jax.Array]:
     """One observed step of N rows: (carry, logits [N, S, C]). Rows with is_first start from zeros. [RSSM-13] to [RSSM-16]"""
-    states = observe(params, carry, *(x[:, None] for x in (tokens, prev_action, is_first, uniform)), config)
+    require_shape("is_first", is_first, "N")
+    N = is_first.shape[0]
+    require_shape("tokens", tokens, N, "E")
+    require_shape("prev_action", prev_action, N, "A")
+    require_shape("uniform", uniform, N, config.stoch)
+    states = observe(params, carry, tokens[:, None], prev_action[:, None], is_first[:, None], uniform[:, None], config)
     return {"deter": states["deter"][:, 0], "stoch": states["stoch"][:, 0]}, states["logits"][:, 0]
 
 
@@ -176,6 +183,7 @@ def observe(
     Raises:
       ValueError: a shape that does not fit. [RSSM-27]
     """
+    require_shape("is_first", is_first, "B", "T")
     B, T = is_first.shape
     kernel = params["rssm/posterior/hidden0/kernel"]
     require_shape("tokens", tokens, B, T, kernel.shape[0] - config.deter)
@@ -287,10 +295,13 @@ _observe_loop.defvjp(_observe_loop_fwd, _observe_loop_bwd)
 def imagine(
     params: Params, carry: Carry, policy: Callable[[jax.Array, jax.Array], jax.Array], uniform: jax.Array, config: Config
 ) -> Arrays:
-    """Follows a policy through the prior: {"deter" [N, H+1, D], "stoch" [N, H+1, S, C], "action" [N, H, A]}, constants. [RSSM-20] to [RSSM-25]
+    """Follows a policy through the prior, constant: {"deter" [N, H+1, D], "stoch" [N, H+1, S, C], "action" [N, H, A]}.
+
+    [RSSM-20] to [RSSM-25]. Trajectories run on after a predicted end.
 
     carry: of N rows; policy(feature [N, F], t) -> action [N, A]; uniform [N, H, S].
     """
+    require_shape("uniform", uniform, "N", "H", config.stoch)
     features, actions = imagine_features(params, carry, policy, uniform.swapaxes(0, 1), config)
     features = features.swapaxes(0, 1)
     stoch = features[..., config.deter :].reshape(*features.shape[:2], config.stoch, config.classes)
@@ -301,10 +312,11 @@ def imagine_features(
     params: Params, carry: Carry, policy: Callable[[jax.Array, jax.Array], jax.Array], uniform: jax.Array, config: Config
 ) -> tuple[jax.Array, jax.Array]:
     """`imagine` with time first, as training wants it: uniform [H, N, S] -> features [H+1, N, F] and actions [H, N, A]."""
-    H, N, _ = uniform.shape
     _check_state(carry["deter"], carry["stoch"], config)
-    require_shape("carry deter", carry["deter"], N, config.deter)
-    require_shape("uniform", uniform, H, N, config.stoch)
+    require_shape("carry deter", carry["deter"], "N", config.deter)
+    N = carry["deter"].shape[0]
+    require_shape("uniform, time first", uniform, "H", N, config.stoch)
+    H = uniform.shape[0]
     params, carry = stop_gradient((dict(params), dict(carry)))
     dtype = compute_dtype(config)
     kernels, biases = _loop_weights(params, _CORE, config)
@@ -314,6 +326,7 @@ def imagine_features(
     def step(carry: tuple[jax.Array, jax.Array], now: tuple[jax.Array, jax.Array]) -> tuple[Any, Any]:
         (deter, feature), (uniform, t) = carry, now
         action = stop_gradient(policy(feature, t))
+        require_shape("action", action, N, params["rssm/embed_action/kernel"].shape[0])
         embedded = _embed_action(params, action, config)
         deter = _core_step(apply, scales, deter, feature[:, config.deter :], embedded, config)
         flat = from_blocks(deter)

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import torch
-import torch.nn.functional as F
+import torch.nn.functional as F  # noqa: N812 (so it is called everywhere)
 from torch import Tensor
 
 from impl_torch.behavior import (
@@ -18,7 +18,7 @@ from impl_torch.behavior import (
     update_slow_critic,
 )
 from impl_torch.distributions import bernoulli_mean, symexp_twohot_mean
-from impl_torch.layers import Params, truncated_normal
+from impl_torch.layers import Params, for_many_rows, truncated_normal
 from impl_torch.networks import Observations, actor, continue_head, critic, encoder, feature, reward_head
 from impl_torch.optimizer import optimizer_step
 from impl_torch.returns import cumulative_weights, lambda_return, replay_lambda_return, return_scale, update_return_range
@@ -49,10 +49,17 @@ def initial_parameters(table: Mapping[str, Parameter], uniforms: Mapping[str, Te
 def initial_state(params: Mapping[str, Tensor]) -> dict[str, Any]:
     """A fresh training state. [AGT-7] [AGT-8] [OPT-13]"""
     zero = next(iter(params.values())).new_zeros(())
+
+    def zeros() -> dict[str, Tensor]:
+        return {name: torch.zeros_like(x) for name, x in params.items()}
+
     return {
         "params": dict(params),
         "slow_critic": {name: x.detach().clone() for name, x in params.items() if name.startswith("critic/")},
-        "optimizer": {"step": 0, **{moment: {name: torch.zeros_like(x) for name, x in params.items()} for moment in ("second_moment", "momentum")}},
+        "optimizer": {
+            "step": 0,
+            **{moment: {name: torch.zeros_like(x) for name, x in params.items()} for moment in ("second_moment", "momentum")},
+        },
         "return_range": {"low": zero, "high": zero.clone()},
     }
 
@@ -88,15 +95,17 @@ def losses(
     spaces: Spaces,
     config: Config,
 ) -> tuple[Tensor, dict[str, Any]]:
-    """The total loss of a train step and everything else that comes out of it. [AGT-14] to [AGT-28] [RET-3] to [RET-6] [RET-11] [BEH-11] [BEH-16]
+    """The total loss of a train step and everything else that comes out of it.
 
-    return_range: (low, high); batch: observations [B, T, ...], "reward", "is_first", "is_last", "is_terminal" [B, T], "prev_action" [B, T, A],
-    "deter" [B, D], "stoch" [B, S] class indices; noise: "posterior" [B, T, S], "prior" [N, H, S], "action" [N, H, K].
+    [AGT-14] to [AGT-28] [RET-3] to [RET-6] [RET-11] [BEH-11] [BEH-16] [BEH-18]
+    return_range: (low, high); batch: observations [B, T, ...], "reward", "is_first", "is_last", "is_terminal" [B, T],
+    "prev_action" [B, T, A], "deter" [B, D], "stoch" [B, S] class indices;
+    noise: "posterior" [B, T, S], "prior" [N, H, S], "action" [N, H, K];
     aux: "losses" {name: scalar} with gradients, "return_range", "deter" [B, T, D], "stoch" [B, T, S, C] and "metrics" {name: scalar}.
     """
     B, T = _check(params, batch, noise, spaces, config)
-    params = prepare(params, config)
-    frozen, slow_critic = freeze(params, config), freeze(slow_critic, config)
+    params = for_many_rows(prepare(params, config))
+    frozen, slow_critic = freeze(params, config), for_many_rows(freeze(slow_critic, config))
     H = config.imagination_horizon
     dtype = wide_dtype(config)
     bins = standard_bins(config.bins, dtype, batch["reward"].device)
@@ -135,7 +144,9 @@ def losses(
     scale = return_scale(low, high, config.return_limit)
 
     # Actor and critic.
-    policies = {key: {name: torch.stack([output[key][name] for output in outputs], 1) for name in outputs[0][key]} for key in spaces.actions}
+    policies = {
+        key: {name: torch.stack([output[key][name] for output in outputs], 1) for name in outputs[0][key]} for key in spaces.actions
+    }
     log_prob = action_log_prob(policies, torch.stack(actions, 1), spaces, config)
     entropy = action_entropy(policies, spaces, config)
     values["actor"] = actor_loss(log_prob, entropy, returns, value[:, :H], weight, scale, config)
@@ -226,7 +237,10 @@ def gradients(
 def train_step(
     state: State, batch: Observations, noise: Mapping[str, Tensor], spaces: Spaces, config: Config
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """One training step as a function: a new state and aux. `Learner` does the same in place. [AGT-29] [AGT-30] [AGT-31] [OPT-21] [BEH-21]"""
+    """One training step as a function: a new state and aux. `Learner` does the same in place.
+
+    [AGT-29] [AGT-30] [AGT-31] [OPT-21] [BEH-21]
+    """
     return_range = (state["return_range"]["low"], state["return_range"]["high"])
     by_name, _, aux = gradients(state["params"], state["slow_critic"], return_range, batch, noise, spaces, config)
     params, optimizer = optimizer_step(state["params"], by_name, state["optimizer"], config)

@@ -1,6 +1,7 @@
 """Actor and critic: actions, log-probabilities, entropies, losses, the slow critic. Chapter: spec/08-behavior.md."""
 
-from collections.abc import Iterator, Mapping
+import dataclasses
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
@@ -22,24 +23,64 @@ from impl_torch.shapes import expect_keys, expect_same_shape, expect_shape, wide
 from impl_torch.transforms import standard_bins
 from spec import Config, Spaces, Vector
 
-# One distribution of a policy: its parameters, how many entries it has in a flat action and how many in the noise.
-Part = tuple[tuple[Tensor, ...], int, int]
+
+@dataclasses.dataclass(frozen=True)
+class _Categorical:
+    """One entry of a Discrete. [BEH-2] [BEH-3]"""
+
+    log_probs: Tensor  # [..., classes]
+
+    @property
+    def sizes(self) -> tuple[int, int]:
+        """How many entries it has in a flat action and in the noise."""
+        return self.log_probs.shape[-1], 1
+
+    def sample(self, noise: Tensor) -> Tensor:
+        return categorical_sample(self.log_probs, noise.squeeze(-1))
+
+    def log_prob(self, action: Tensor) -> Tensor:
+        return categorical_log_prob(self.log_probs, action)
+
+    def entropy(self) -> Tensor:
+        return categorical_entropy(self.log_probs)
 
 
-def _parts(outputs: Outputs, spaces: Spaces, config: Config) -> Iterator[Part]:
-    """Per key in sorted order: mean and std [..., size] of a Vector, log-probabilities [..., classes] of each entry of a Discrete. [BEH-2] [BEH-4]"""
+@dataclasses.dataclass(frozen=True)
+class _Normal:
+    """All dimensions of a Vector. [BEH-4]"""
+
+    mean: Tensor  # [..., size]
+    std: Tensor  # [..., size]
+
+    @property
+    def sizes(self) -> tuple[int, int]:
+        return self.mean.shape[-1], self.mean.shape[-1]
+
+    def sample(self, noise: Tensor) -> Tensor:
+        return normal_sample(self.mean, self.std, noise)
+
+    def log_prob(self, action: Tensor) -> Tensor:
+        return normal_log_prob(self.mean, self.std, action).sum(-1)
+
+    def entropy(self) -> Tensor:
+        return normal_entropy(self.std).sum(-1)
+
+
+def _distributions(outputs: Outputs, spaces: Spaces, config: Config) -> list[_Categorical | _Normal]:
+    """The independent parts of a policy, in the order of a flat action."""
     expect_keys("outputs", outputs, spaces.actions, exactly=True)
     leading = _leading(outputs)
+    parts: list[_Categorical | _Normal] = []
     for key, space in spaces.actions.items():
-        expect_keys(f"outputs[{key!r}]", outputs[key], ("mean", "std") if isinstance(space, Vector) else ("logits",), exactly=True)
-        for name, x in outputs[key].items():
+        raw = outputs[key]
+        expect_keys(f"outputs[{key!r}]", raw, ("mean", "std") if isinstance(space, Vector) else ("logits",), exactly=True)
+        for name, x in raw.items():
             expect_shape(f"outputs[{key!r}][{name!r}]", x, (*leading, space.encoded_size))
         if isinstance(space, Vector):
-            raw = outputs[key]
-            yield bounded_normal(raw["mean"], raw["std"], config.actor_min_std, config.actor_max_std), space.size, space.size
+            parts.append(_Normal(*bounded_normal(raw["mean"], raw["std"], config.actor_min_std, config.actor_max_std)))
         else:
-            for logits in outputs[key]["logits"].split(space.classes, -1):
-                yield (unimix_log_probs(logits, config.actor_unimix),), logits.shape[-1], 1
+            parts += [_Categorical(unimix_log_probs(logits, config.actor_unimix)) for logits in raw["logits"].split(space.classes, -1)]
+    return parts
 
 
 def _leading(outputs: Outputs) -> torch.Size:
@@ -49,39 +90,32 @@ def _leading(outputs: Outputs) -> torch.Size:
 @torch.no_grad()
 def sample_action(outputs: Outputs, noise: Tensor, spaces: Spaces, config: Config) -> Tensor:
     """A flat action [..., A], constant, from noise [..., K]. [BEH-1] [BEH-3] [BEH-4] [BEH-5] [BEH-8] [BEH-22] [BEH-23]"""
-    parts = list(_parts(outputs, spaces, config))
+    parts = _distributions(outputs, spaces, config)
     expect_shape("noise", noise, (*_leading(outputs), spaces.action_noise_size))
-    actions = []
-    for (distribution, _, _), x in zip(parts, noise.split([taken for _, _, taken in parts], -1), strict=True):
-        categorical = len(distribution) == 1
-        actions.append(categorical_sample(distribution[0], x.squeeze(-1)) if categorical else normal_sample(*distribution, x))
-    return torch.cat(actions, -1)
+    pieces = noise.split([part.sizes[1] for part in parts], -1)
+    return torch.cat([part.sample(piece) for part, piece in zip(parts, pieces, strict=True)], -1)
 
 
 def action_log_prob(outputs: Outputs, action: Tensor, spaces: Spaces, config: Config) -> Tensor:
     """Log-probability of a flat action [..., A], a constant, summed over everything: [...]. [BEH-5] [BEH-6] [BEH-22] [BEH-23]"""
-    parts = list(_parts(outputs, spaces, config))
+    parts = _distributions(outputs, spaces, config)
     expect_shape("action", action, (*_leading(outputs), spaces.action_size))
-    terms = []
-    for (distribution, _, _), x in zip(parts, action.detach().split([size for _, size, _ in parts], -1), strict=True):
-        categorical = len(distribution) == 1
-        terms.append(categorical_log_prob(distribution[0], x) if categorical else normal_log_prob(*distribution, x).sum(-1))
-    return torch.stack(terms).sum(0)
+    pieces = action.detach().split([part.sizes[0] for part in parts], -1)
+    return torch.stack([part.log_prob(piece) for part, piece in zip(parts, pieces, strict=True)]).sum(0)
 
 
 def action_entropy(outputs: Outputs, spaces: Spaces, config: Config) -> Tensor:
     """Entropy of the policy in nats, summed over everything: [...]. [BEH-7] [BEH-22] [BEH-23]"""
-    terms = []
-    for distribution, _, _ in _parts(outputs, spaces, config):
-        categorical = len(distribution) == 1
-        terms.append(categorical_entropy(distribution[0]) if categorical else normal_entropy(distribution[1]).sum(-1))
-    return torch.stack(terms).sum(0)
+    return torch.stack([part.entropy() for part in _distributions(outputs, spaces, config)]).sum(0)
 
 
 def actor_loss(
     log_prob: Tensor, entropy: Tensor, returns: Tensor, value: Tensor, weight: Tensor, scale: Tensor | float, config: Config
 ) -> Tensor:
-    """-weight * (advantage * log_prob + entropy_scale * entropy): [N, H] five times -> [N, H]. [BEH-9] [BEH-10] [BEH-22] [BEH-23] [BEH-24]"""
+    """-weight * (advantage * log_prob + entropy_scale * entropy): [N, H] five times -> [N, H].
+
+    [BEH-9] [BEH-10] [BEH-22] [BEH-23] [BEH-24]
+    """
     expect_same_shape(log_prob=log_prob, entropy=entropy, returns=returns, value=value, weight=weight)
     log_prob = widen(log_prob)
     scale = torch.as_tensor(scale)
@@ -92,7 +126,10 @@ def actor_loss(
 
 
 def critic_loss(logits: Tensor, slow_logits: Tensor, returns: Tensor, weight: Tensor, config: Config) -> Tensor:
-    """weight * (CE towards the return + slow_critic_scale * CE towards the slow mean): [N, H]. [BEH-12] [BEH-13] [BEH-22] [BEH-23] [BEH-24]"""
+    """weight * (CE towards the return + slow_critic_scale * CE towards the slow mean): [N, H].
+
+    [BEH-12] [BEH-13] [BEH-22] [BEH-23] [BEH-24]
+    """
     expect_same_shape(returns=returns, weight=weight)
     return weight.detach() * _critic_cross_entropy(logits, slow_logits, returns, config)
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
-import torch.nn.functional as F
+import torch.nn.functional as F  # noqa: N812 (so it is called everywhere)
 from torch import Tensor
 
 from impl_torch.shapes import expect, expect_last, expect_shape, widen
@@ -49,7 +49,7 @@ class _NarrowProduct(torch.autograd.Function):
         return torch.bmm(x, narrow) if bias is None else torch.baddbmm(bias.to(x.dtype), x, narrow)
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> Any:  # type: ignore[override]
+    def backward(ctx: Any, gradient: Tensor) -> Any:
         x, kernel = ctx.saved_tensors
         kernel_dtype, bias_dtype = ctx.dtypes
         by_x = torch.bmm(gradient, kernel.mT) if ctx.needs_input_grad[0] else None
@@ -59,6 +59,16 @@ class _NarrowProduct(torch.autograd.Function):
 
 def _as_convolution(x: Tensor, rows: int) -> bool:
     return rows >= CONVOLUTION_ROWS and x.device.type == "cpu" and x.dtype == torch.float32 and torch.backends.mkldnn.is_available()
+
+
+def for_many_rows(params: Params) -> Params:
+    """The same parameters with kernels in the memory order that oneDNN wants, or every product would bring its kernel into it first."""
+
+    def arrange(x: Tensor) -> Tensor:
+        fits = x.ndim in (2, 3) and _as_convolution(x, CONVOLUTION_ROWS)
+        return x.mT.contiguous().mT if fits else x
+
+    return {name: arrange(x) for name, x in params.items()}
 
 
 def _pointwise(x: Tensor, weight: Tensor, bias: Tensor | None, groups: int) -> Tensor:
@@ -166,7 +176,7 @@ class _NormSilu(torch.autograd.Function):
         return norm_silu_forward(x, scale, epsilon)
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, None]:  # type: ignore[override]
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, None]:
         x, scale = ctx.saved_tensors
         normal, inverse = normalize(x, ctx.epsilon)
         wide = scale.to(x.dtype).to(normal.dtype)

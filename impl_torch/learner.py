@@ -46,7 +46,7 @@ class Learner:
         self._critic_flat = self._flat[-self._critic_layout.total :]  # the critic is the last of the table
         self._slow_flat = self._critic_flat.clone()
         self._slow_critic = self._critic_layout.views(self._slow_flat)
-        self._second_moment, self._momentum = torch.zeros_like(self._flat), torch.zeros_like(self._flat)
+        self._second_moment, self._momentum, self._gradient = (torch.zeros_like(self._flat) for _ in range(3))
         self._set_step(0)
         self._low, self._high = torch.zeros((2,), dtype=self._dtype, device=self._device).unbind()
         self._policy_calls = self._train_steps = 0
@@ -59,7 +59,9 @@ class Learner:
         return {name: torch.zeros(envs, *shape, dtype=compute_dtype(c), device=self._device) for name, shape in shapes.items()}
 
     @torch.no_grad()
-    def policy(self, observation: Arrays, is_first: np.ndarray, carry: Mapping[str, Tensor]) -> tuple[np.ndarray, Arrays, dict[str, Tensor]]:
+    def policy(
+        self, observation: Arrays, is_first: np.ndarray, carry: Mapping[str, Tensor]
+    ) -> tuple[np.ndarray, Arrays, dict[str, Tensor]]:
         """One acting step: observation {key: [N, ...]}, is_first [N] -> (action [N, A], latents, carry). [AGT-11]"""
         generator = self._generator(POLICY, self._policy_calls)
         self._policy_calls += 1
@@ -70,7 +72,9 @@ class Learner:
         if self._acting is None:
             self._acting = freeze(self.parameters.mapping(), self.config)
         inputs = {key: self._to_device(observation[key]) for key in self.spaces.observations}
-        state, action = policy_step(self._acting, carry, carry["action"], inputs, self._to_device(is_first), noise, self.spaces, self.config)
+        state, action = policy_step(
+            self._acting, carry, carry["action"], inputs, self._to_device(is_first), noise, self.spaces, self.config
+        )
         latents = {"deter": state["deter"].float().cpu().numpy(), "stoch": state["stoch"].argmax(-1).cpu().numpy()}
         return action.float().cpu().numpy(), latents, state | {"action": action}
 
@@ -79,9 +83,12 @@ class Learner:
         config = self.config
         inputs = {name: self._to_device(x) for name, x in batch.items()}
         params = self.parameters.mapping()
-        by_name, total, aux = gradients(params, self._slow_critic, (self._low, self._high), inputs, self._train_noise(inputs), self.spaces, config)
+        by_name, total, aux = gradients(
+            params, self._slow_critic, (self._low, self._high), inputs, self._train_noise(inputs), self.spaces, config
+        )
         with torch.no_grad():
-            norms, factors = flat_step_(self._optimizer, self._flat, self._layout.pack(by_name.values()), self._layout, config)
+            self._layout.pack(by_name.values(), out=self._gradient)
+            norms, factors = flat_step_(self._optimizer, self._flat, self._gradient, self._layout, config)
             self._slow_flat.lerp_(self._critic_flat, 1 - config.slow_critic_decay)
             self._low, self._high = aux["return_range"]
             self._train_steps += 1
@@ -116,7 +123,9 @@ class Learner:
           ValueError: a missing or unexpected name, or a wrong shape; nothing is changed then.
         """
         tensors = self._tensors()
-        shapes = {name: tuple(x.shape) for name, x in tensors.items()} | dict.fromkeys(("optimizer/step", "counters/policy", "counters/train"), ())
+        shapes = {name: tuple(x.shape) for name, x in tensors.items()} | dict.fromkeys(
+            ("optimizer/step", "counters/policy", "counters/train"), ()
+        )
         problems = [f"missing {name}" for name in sorted(set(shapes) - set(state))]
         problems += [f"unexpected {name}" for name in sorted(set(state) - set(shapes))]
         for name in sorted(set(shapes).intersection(state)):
@@ -196,7 +205,9 @@ def select_device(device: str | None) -> torch.device:
         raise ValueError(f"unknown device {device!r}; expected cpu, gpu, cuda or cuda:<number>")
     if kind == "cuda" and int(index or 0) >= torch.cuda.device_count():
         build = "a build for CPUs only" if torch.version.cuda is None and torch.version.hip is None else f"{torch.cuda.device_count()} GPUs"
-        raise ValueError(f"device {device!r} is not there: PyTorch {torch.__version__} has {build}; use --device cpu or install a build for GPUs")
+        raise ValueError(
+            f"device {device!r} is not there: PyTorch {torch.__version__} has {build}; use --device cpu or install a build for GPUs"
+        )
     return torch.device(kind, int(index)) if index else torch.device(kind)
 
 
@@ -220,7 +231,7 @@ class _Element:
         self._array, self._index = array, index
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
-        return np.asarray(self._array, dtype)[self._index]
+        return np.asarray(np.asarray(self._array)[self._index], dtype)
 
     def __float__(self) -> float:
         return float(np.asarray(self._array)[self._index])

@@ -7,7 +7,7 @@ import functools
 from collections.abc import Mapping
 
 import torch
-import torch.nn.functional as F
+import torch.nn.functional as F  # noqa: N812 (so it is called everywhere)
 from torch import Tensor
 
 from impl_torch.layers import (
@@ -108,10 +108,13 @@ def _encode_image(params: Params, image: Tensor, config: Config) -> Tensor:
 
 
 def decoder(params: Params, feature: Tensor, spaces: Spaces, config: Config) -> dict[str, Tensor]:
-    """[..., F] -> {key: [..., size] in symlog space, logits [..., sum of classes] or image [..., H, W, C] in [0, 1]}. [NET-13] to [NET-19] [NET-25]"""
+    """[..., F] -> {key: [..., size] in symlog space, logits [..., sum of classes] or image [..., H, W, C] in [0, 1]}.
+
+    [NET-13] to [NET-19] [NET-24] to [NET-27]
+    """
     expect_last("feature", feature, config.feature_size)
     x = feature.to(compute_dtype(config))
-    outputs = {}
+    outputs: dict[str, Tensor] = {}
     if spaces.vectors:
         hidden = mlp(params, "decoder/vector", x, config.decoder_layers, config.norm_epsilon)
         outputs |= {key: _out(params, f"decoder/vector/out/{key}", hidden, config) for key in spaces.vectors}

@@ -56,10 +56,10 @@ def clip_flat_gradients_(gradients: Tensor, parameters: Tensor, layout: Layout, 
     gradients, parameters [total]. Returns the norm of each tensor's gradient before clipping [P] and the factors [P].
     """
     counts, owner = layout.row_counts(gradients.device)
-    norms = [_segment_norms(x.view(-1, ROW), counts, owner) for x in (gradients, parameters)]
-    factors = _clip_factor(*norms, clip, epsilon)
+    norms, parameter_norms = (_segment_norms(x.view(-1, ROW), counts, owner) for x in (gradients, parameters))
+    factors = _clip_factor(norms, parameter_norms, clip, epsilon)
     gradients.view(-1, ROW).mul_(factors.to(gradients.dtype)[owner].unsqueeze(-1))
-    return norms[0], factors
+    return norms, factors
 
 
 def _segment_norms(rows: Tensor, counts: Tensor, owner: Tensor) -> Tensor:
@@ -87,10 +87,13 @@ def _correction(beta: float, step: int) -> float:
     return -math.expm1((step + 1) * math.log(beta)) if beta else 1.0
 
 
-def _laprop_(
-    gradient: Tensor, second_moment: Tensor, momentum: Tensor, step: int, beta1: float, beta2: float, epsilon: float, out: Tensor, rate: float
-) -> None:
-    """Updates both moments in place and subtracts rate * update from `out`; all of one shape. [OPT-8] to [OPT-12]"""
+def _laprop_(tensors: tuple[Tensor, Tensor, Tensor, Tensor], step: int, betas: tuple[float, float], epsilon: float, rate: float) -> None:
+    """Updates both moments in place and subtracts rate * update from `out`; all of one shape. [OPT-8] to [OPT-12]
+
+    tensors: gradient, second moment, momentum, out.
+    """
+    gradient, second_moment, momentum, out = tensors
+    beta1, beta2 = betas
     first, second = _correction(beta1, step), _correction(beta2, step)
     gradient = gradient.masked_fill(gradient.abs() < DEAD_ZONE, 0)
     second_moment.mul_(beta2).addcmul_(gradient, gradient, value=1 - beta2)
@@ -105,14 +108,14 @@ def laprop(gradient: Tensor, second_moment: Tensor, momentum: Tensor, step: int,
     """(update, new second moment, new momentum), without learning rate and sign; any shape. [OPT-8] to [OPT-14]"""
     expect_same_shape(gradient=gradient, second_moment=second_moment, momentum=momentum)
     second_moment, momentum, update = second_moment.clone(), momentum.clone(), torch.zeros_like(momentum)
-    _laprop_(gradient, second_moment, momentum, step, config.beta1, config.beta2, config.laprop_epsilon, update, -1.0)
+    _laprop_((gradient, second_moment, momentum, update), step, (config.beta1, config.beta2), config.laprop_epsilon, -1.0)
     return update, second_moment, momentum
 
 
 class LaProp(torch.optim.Optimizer):
     """LaProp: RMSProp's normalization first, momentum afterwards. [OPT-8] to [OPT-16] [OPT-20]
 
-    Per parameter the state is "step" (int), "second_moment" and "momentum". There is no weight decay and no clipping: see `clip_gradients_`.
+    Per parameter the state is "step" (int), "second_moment" and "momentum". No weight decay, and no clipping: see `clip_gradients_`.
 
     Raises:
       ValueError: a beta outside [0, 1).
@@ -124,7 +127,7 @@ class LaProp(torch.optim.Optimizer):
         super().__init__(params, {"lr": lr, "betas": betas, "eps": eps})
 
     @torch.no_grad()
-    def step(self, closure: Callable[[], Any] | None = None) -> Any:  # type: ignore[override]
+    def step(self, closure: Callable[[], Any] | None = None) -> Any:
         """One update of every parameter that has a gradient. closure: computes the loss again, with gradients."""
         loss = None
         if closure is not None:
@@ -141,13 +144,13 @@ class LaProp(torch.optim.Optimizer):
         if not state:
             state |= {"step": 0, "second_moment": torch.zeros_like(parameter), "momentum": torch.zeros_like(parameter)}
         tensors = (gradient, state["second_moment"], state["momentum"], parameter)
-        chunks = _chunks(*tensors) if parameter.device.type == "cpu" else [tensors]
-        for part, second_moment, momentum, out in chunks:
-            _laprop_(part, second_moment, momentum, state["step"], *group["betas"], group["eps"], out, group["lr"])
+        chunks: Iterable[Any] = _chunks(*tensors) if parameter.device.type == "cpu" else [tensors]
+        for chunk in chunks:
+            _laprop_(chunk, state["step"], group["betas"], group["eps"], group["lr"])
         state["step"] += 1
 
 
-def _chunks(*tensors: Tensor) -> Iterable[tuple[Tensor, ...]]:
+def _chunks(*tensors: Tensor) -> Iterable[Any]:
     """Pieces of CHUNK numbers, where memory allows to walk through the tensors as through vectors."""
     if not all(x.is_contiguous() for x in tensors):
         return [tensors]
@@ -168,9 +171,7 @@ def optimizer_step(
         for name, x in params.items():
             expect_shape(f"{what}[{name!r}]", tree[name], x.shape)
     layout, dtype, step = Layout({name: tuple(x.shape) for name, x in params.items()}), wide_dtype(config), int(state["step"])
-    flat, gradient, second_moment, momentum = (
-        layout.pack(tree[name].to(dtype) for name in params) for tree in (params, *trees.values())
-    )
+    flat, gradient, second_moment, momentum = (layout.pack(tree[name].to(dtype) for name in params) for tree in (params, *trees.values()))
     optimizer = flat_optimizer(flat, second_moment, momentum, step, config)
     flat_step_(optimizer, flat, gradient, layout, config)
     moments = {"second_moment": layout.views(second_moment), "momentum": layout.views(momentum)}

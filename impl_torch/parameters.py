@@ -1,8 +1,9 @@
 """The parameter table in memory: one flat buffer, and an `nn.Module` whose parameters are views of it.
 
-Why flat: the optimizer and the slow critic then are a handful of operations on long vectors instead of a few on each of a hundred tensors,
-without PyTorch's private `_foreach` functions. Why one module with names that hold slashes, and not a tree of modules: `state_dict()` is the
-canonical table as it stands, and a task may call its action "forward" or "type", which no child of an `nn.Module` can be called.
+Why flat: the optimizer and the slow critic then are a handful of operations on long vectors instead of a few on each of a hundred
+tensors, without PyTorch's private `_foreach` functions. Why one module whose parameter names hold slashes, and not a tree of modules:
+`state_dict()` is the canonical table as it stands, and a task may call its action "forward" or "type", which no child of an `nn.Module`
+can be called.
 """
 
 import math
@@ -32,13 +33,13 @@ class Layout:
         pieces = flat.split([ROW * rows for rows in self.rows.values()])
         return {name: piece[: self.sizes[name]].view(self.shapes[name]) for name, piece in zip(self.shapes, pieces, strict=True)}
 
-    def pack(self, tensors: Iterable[Tensor]) -> Tensor:
-        """One flat buffer [total] out of all tensors, in the order of the names."""
+    def pack(self, tensors: Iterable[Tensor], out: Tensor | None = None) -> Tensor:
+        """One flat buffer [total] out of all tensors, in the order of the names; a new one, or `out`."""
         pieces = []
         for (name, rows), x in zip(self.rows.items(), tensors, strict=True):
             gap = ROW * rows - self.sizes[name]
             pieces += [x.reshape(-1), x.new_zeros(gap)] if gap else [x.reshape(-1)]
-        return torch.cat(pieces)
+        return torch.cat(pieces, out=out)
 
     def row_counts(self, device: torch.device) -> tuple[Tensor, Tensor]:
         """How many rows each tensor has [P], and which tensor each row belongs to [total / ROW]."""

@@ -34,7 +34,9 @@ def lambda_return(reward: Tensor, continue_: Tensor, value: Tensor, discount: fl
 
 
 @torch.no_grad()
-def replay_lambda_return(reward: Tensor, is_last: Tensor, is_terminal: Tensor, annotation: Tensor, discount: float, lambda_: float) -> Tensor:
+def replay_lambda_return(
+    reward: Tensor, is_last: Tensor, is_terminal: Tensor, annotation: Tensor, discount: float, lambda_: float
+) -> Tensor:
     """λ-returns of replayed sequences with true flags: [B, T] four times -> [B, T-1]. [RET-9] [RET-10] [RET-17] [RET-19] [RET-20]"""
     _check("reward", reward=reward, is_last=is_last, is_terminal=is_terminal, annotation=annotation)
     annotation = widen(annotation)[:, 1:]

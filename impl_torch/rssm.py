@@ -9,9 +9,9 @@ from collections.abc import Callable, Mapping
 import torch
 from torch import Tensor
 
-from impl_torch.distributions import categorical_sample, straight_through, unimix_log_probs
+from impl_torch.distributions import categorical_sample, sample_onehot, straight_through, unimix_log_probs, unimix_probs
 from impl_torch.layers import Params, block_linear, dense, linear, mlp, norm_silu
-from impl_torch.scan import ScanOptions, ScanWeights, scan
+from impl_torch.scan import ScanOptions, ScanWeights, gru, scan
 from impl_torch.shapes import compute_dtype, expect, expect_last, expect_shape, wide_dtype
 from spec import Config
 
@@ -34,11 +34,10 @@ def prepare(params: Params, config: Config) -> Params:
 
 
 def freeze(params: Params, config: Config) -> Params:
-    """`prepare`, as constants, with kernels in the compute dtype: for many calls without gradients."""
-    dtype = compute_dtype(config)
+    """The same, as constants with kernels in the compute dtype: for many calls without gradients."""
     with torch.no_grad():
-        kernels = (*prepare(params, config).items(),)
-        return {name: x.detach().to(dtype) if x.ndim > 1 else x.detach() for name, x in kernels}
+        prepared = prepare(params, config)
+        return {name: x.detach().to(compute_dtype(config)) if x.ndim > 1 else x.detach() for name, x in prepared.items()}
 
 
 def core(params: Params, deter: Tensor, stoch: Tensor, action: Tensor, config: Config) -> Tensor:
@@ -52,13 +51,10 @@ def core(params: Params, deter: Tensor, stoch: Tensor, action: Tensor, config: C
     embedded = torch.stack([linear(x, params[f"{name}/kernel"], params[f"{name}/bias"]) for name, x in inputs.items()], -2)
     scale = torch.stack([params[f"{name}/scale"] for name in inputs])
     embedded = norm_silu(embedded, scale, epsilon).flatten(-2)
-    hidden = linear(embedded, params[SHARED], params["rssm/hidden/bias"]) + block_linear(deter, params[BLOCK], None)
+    hidden = linear(embedded, params[SHARED], params["rssm/hidden/bias"]).add_(block_linear(deter, params[BLOCK], None))
     hidden = norm_silu(hidden, params["rssm/hidden/scale"], epsilon)
-    gates = block_linear(hidden, params["rssm/gru/kernel"], params["rssm/gru/bias"]).unflatten(-1, (config.blocks, 3, -1))
-    reset, candidate, update = gates.unbind(-2)
-    candidate = torch.tanh(torch.sigmoid(reset) * candidate)
-    memory = deter.unflatten(-1, (config.blocks, -1))
-    return torch.lerp(memory, candidate, torch.sigmoid(update - 1)).flatten(-2)
+    gates = block_linear(hidden, params["rssm/gru/kernel"], params["rssm/gru/bias"])
+    return gru(gates.unflatten(-1, (config.blocks, 3, -1)), deter.unflatten(-1, (config.blocks, -1))).flatten(-2)
 
 
 def _bounded(action: Tensor) -> Tensor:
@@ -105,9 +101,7 @@ def observe_step(
     expect_shape("uniform", uniform, (rows, config.stoch))
     params, dtype = prepare(params, config), compute_dtype(config)
     first = is_first.bool()
-    deter, stoch, action = (
-        x.to(dtype).masked_fill(first.view(-1, *[1] * (x.ndim - 1)), 0) for x in (deter, stoch, prev_action)
-    )
+    deter, stoch, action = (x.to(dtype).masked_fill(first.view(-1, *[1] * (x.ndim - 1)), 0) for x in (deter, stoch, prev_action))
     deter = core(params, deter, stoch, action, config)
     logits = posterior(params, deter, tokens, config)
     log_probs = unimix_log_probs(logits, config.latent_unimix)
@@ -132,8 +126,8 @@ def observe(
     expect_shape("uniform", uniform, (*shape, config.stoch))
     params, dtype, epsilon = prepare(params, config), compute_dtype(config), config.norm_epsilon
 
-    # What does not depend on the recurrent state leaves the loop: the action's embedding with its share of rssm/hidden, and the tokens' share
-    # of the posterior's first layer.
+    # What does not depend on the recurrent state leaves the loop: the action's embedding with its share of rssm/hidden, and the tokens'
+    # share of the posterior's first layer.
     first = is_first.bool().t()
     action = prev_action.to(dtype).transpose(0, 1).masked_fill(first.unsqueeze(-1), 0)
     action = dense(params, "rssm/embed_action", _bounded(action), epsilon)
@@ -193,8 +187,8 @@ def imagine_features(params: Params, carry: Carry, policy: Policy, uniform: Tens
     for t in range(uniform.shape[1]):
         actions.append(policy(features[t], t))
         deter = core(params, deter, stoch, actions[t], config)
-        log_probs = unimix_log_probs(prior(params, deter, config), config.latent_unimix)
-        stoch = categorical_sample(log_probs, uniform[:, t]).to(dtype)
+        probs = unimix_probs(prior(params, deter, config), config.latent_unimix)
+        stoch = sample_onehot(probs, uniform[:, t]).to(dtype)
         features.append(torch.cat([deter, stoch.flatten(1)], -1))
     return features, actions
 

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from impl_torch.distributions import sample_onehot
+from impl_torch.distributions import sample_onehot, unimix_probs
 from impl_torch.layers import norm_silu_forward, normalize, silu_slope, wide_product
 from impl_torch.shapes import widen
 
@@ -44,8 +44,10 @@ class ScanWeights:
 
     @classmethod
     def from_flat(cls, tensors: tuple[Tensor, ...]) -> "ScanWeights":
-        count = len(dataclasses.fields(cls)) - 1
-        return cls(*tensors[:count], tuple(zip(*[iter(tensors[count:])] * 3, strict=True)))  # type: ignore[arg-type]
+        names = [field.name for field in dataclasses.fields(cls)][:-1]
+        count = len(names)
+        deeper = tuple((tensors[i], tensors[i + 1], tensors[i + 2]) for i in range(count, len(tensors), 3))
+        return cls(**dict(zip(names, tensors[:count], strict=True)), deeper=deeper)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,6 +69,44 @@ def scan(
     return _Scan.apply(options, carry, is_first, uniform, action_drive, token_drive, *weights.flat())
 
 
+def gru(gates: Tensor, deter: Tensor) -> Tensor:
+    """The new memory [..., n] from reset, candidate and update [..., 3, n] and the old memory [..., n]. [RSSM-7]"""
+    return _Gru.apply(gates, deter)
+
+
+class _Gru(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, gates: Tensor, deter: Tensor) -> Tensor:
+        ctx.save_for_backward(gates, deter)
+        return _gru_forward(gates, deter)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:
+        by_deter, by_gates = _gate_slopes(*ctx.saved_tensors)
+        return (by_gates * gradient.unsqueeze(-2)).to(gradient.dtype), (by_deter * gradient).to(gradient.dtype)
+
+
+def _gru_forward(gates: Tensor, deter: Tensor, out: Tensor | None = None) -> Tensor:
+    reset, candidate, update = gates.unbind(-2)
+    return torch.lerp(deter, _tanh_(torch.sigmoid(reset).mul_(candidate)), (update - 1).sigmoid_(), out=out)
+
+
+def _gate_slopes(gates: Tensor, deter: Tensor) -> tuple[Tensor, Tensor]:
+    """Derivatives of the new memory by the old one [..., n] and by the three gates [..., 3, n]."""
+    reset, candidate, update = widen(gates).unbind(-2)
+    reset, update = torch.sigmoid(reset), torch.sigmoid(update - 1)
+    value = _tanh_(reset * candidate)
+    by_candidate = update * (1 - value * value) * reset
+    by_reset = by_candidate * candidate * (1 - reset)
+    by_update = (value - deter) * update * (1 - update)
+    return 1 - update, torch.stack([by_reset, by_candidate, by_update], -2)
+
+
+def _tanh_(x: Tensor) -> Tensor:
+    """tanh in place, to an error that is small beside 1 (not beside x): on the CPU, PyTorch's own takes five times as long."""
+    return x.tanh_() if x.dtype == torch.float64 or x.device.type != "cpu" else x.mul_(2).sigmoid_().mul_(2).sub_(1)
+
+
 def _blocks(x: Tensor, blocks: int) -> Tensor:
     """[..., B, D] -> [..., G, B, D/G], the same memory."""
     return x.unflatten(-1, (blocks, -1)).transpose(-2, -3)
@@ -75,7 +115,14 @@ def _blocks(x: Tensor, blocks: int) -> Tensor:
 class _Scan(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, options: ScanOptions, carry: Tensor, is_first: Tensor, uniform: Tensor, action_drive: Tensor, token_drive: Tensor, *flat: Tensor
+        ctx: Any,
+        options: ScanOptions,
+        carry: Tensor,
+        is_first: Tensor,
+        uniform: Tensor,
+        action_drive: Tensor,
+        token_drive: Tensor,
+        *flat: Tensor,
     ) -> Any:
         flat = tuple(x.to(action_drive.dtype) for x in flat)
         w, epsilon = ScanWeights.from_flat(flat), options.epsilon
@@ -100,29 +147,24 @@ class _Scan(torch.autograd.Function):
             _blocks(hidden[t], G).baddbmm_(_blocks(deter, G), w.block)
             activated[t] = _blocks(norm_silu_forward(hidden[t], w.hidden_scale, epsilon), G)
             torch.baddbmm(gru_bias, activated[t], w.gru, out=gates[t].flatten(-2))
-            reset, candidate, update = gates[t].unbind(-2)
-            candidate = torch.sigmoid(reset).mul_(candidate).tanh_()
-            torch.lerp(_blocks(deter, G), candidate, torch.sigmoid(update - 1), out=_blocks(feature[:, :D], G))
+            _gru_forward(gates[t], _blocks(deter, G), out=_blocks(feature[:, :D], G))
             torch.addmm(token_drive[t], feature[:, :D], w.post_deter, out=post[0][t])
             x = norm_silu_forward(post[0][t], w.post_scale, epsilon)
             for pre, (kernel, bias, scale) in zip(post[1:], w.deeper, strict=True):
                 torch.addmm(bias, x, kernel, out=pre[t])
                 x = norm_silu_forward(pre[t], scale, epsilon)
             logits[t] = torch.addmm(w.out_bias, x, w.out).view(B, S, -1)
-            probs = torch.softmax(logits[t], -1)
-            if options.unimix:
-                probs.mul_(1 - options.unimix).add_(options.unimix / probs.shape[-1])
-            feature[:, D:] = sample_onehot(probs, uniform[t]).flatten(1)
+            feature[:, D:] = sample_onehot(unimix_probs(logits[t], options.unimix), uniform[t]).flatten(1)
         ctx.options, ctx.kept = options, (states, embed, embedded, hidden, activated, gates, post)
         ctx.save_for_backward(features, logits, is_first, *flat)
         return features, logits
 
     @staticmethod
-    def backward(ctx: Any, by_features: Tensor, by_logits: Tensor) -> Any:  # type: ignore[override]
+    def backward(ctx: Any, by_features: Tensor, by_logits: Tensor) -> Any:
         features, logits, is_first, *flat = ctx.saved_tensors
         states, embed, embedded, hidden, activated, gates, post = ctx.kept
         w, epsilon = ScanWeights.from_flat(tuple(flat)), ctx.options.epsilon
-        (T, B, D), G = hidden.shape, len(w.block)
+        T, D, G = len(hidden), hidden.shape[-1], len(w.block)
         post_scales = [w.post_scale, *(scale for _, _, scale in w.deeper)]
         post_kernels = [kernel for kernel, _, _ in w.deeper] + [w.out]
 
@@ -131,7 +173,7 @@ class _Scan(torch.autograd.Function):
         back_hidden = _NormSiluBack(hidden, w.hidden_scale, epsilon)
         back_post = [_NormSiluBack(x, scale, epsilon) for x, scale in zip(post, post_scales, strict=True)]
         keep, by_deter = _gate_slopes(gates, _blocks(states[..., :D], G))
-        softmax = torch.softmax(logits, -1)
+        softmax = unimix_probs(logits, 0.0)
         mixed = softmax * (1 - ctx.options.unimix)
 
         by_embed, by_hidden, by_gates = torch.empty_like(embed), torch.empty_like(hidden), torch.empty_like(gates)
@@ -206,17 +248,6 @@ class _NormSiluBack:
     def output(self, dtype: torch.dtype) -> Tensor:
         """silu(rms_norm(x)), again."""
         return torch.nn.functional.silu((self.normal * self.scale).to(dtype))
-
-
-def _gate_slopes(gates: Tensor, deter: Tensor) -> tuple[Tensor, Tensor]:
-    """Derivatives of the new memory by the old one, [T, G, B, D/G], and by the three gates, [T, G, B, 3, D/G]."""
-    reset, candidate, update = widen(gates).unbind(-2)
-    reset, update = torch.sigmoid(reset), torch.sigmoid(update - 1)
-    value = torch.tanh(reset * candidate)
-    by_candidate = update * (1 - value * value) * reset
-    by_reset = by_candidate * candidate * (1 - reset)
-    by_update = (value - deter) * update * (1 - update)
-    return 1 - update, torch.stack([by_reset, by_candidate, by_update], -2)
 
 
 def _product(x: Tensor, y: Tensor) -> Tensor:

@@ -25,7 +25,9 @@ def symexp(x: Tensor) -> Tensor:
 
 @functools.cache
 def exponential_bins(bins: int) -> np.ndarray:
-    """`bins` positions [bins], NumPy float64 (do not write to it): symexp of even steps from -20 to 20, exactly antisymmetric. [TRA-5] [TRA-6]
+    """`bins` positions [bins], NumPy float64 (do not write to it): symexp of even steps from -20 to 20, exactly antisymmetric.
+
+    [TRA-5] [TRA-6]
 
     Raises:
       ValueError: an even number, or fewer than 3.
@@ -46,7 +48,9 @@ def standard_bins(bins: int, dtype: torch.dtype, device: torch.device) -> Tensor
 
 
 def twohot(x: Tensor, bins: Bins) -> Tensor:
-    """Weights of the two bins around x: [...] and [K] -> [..., K]; the ends are clamped, NaN gives NaN. [TRA-1] [TRA-7] [TRA-8] [TRA-9] [TRA-13] [TRA-14]
+    """Weights of the two bins around x: [...] and [K] -> [..., K]; the ends are clamped, NaN gives NaN.
+
+    [TRA-1] [TRA-7] [TRA-8] [TRA-9] [TRA-13] [TRA-14]
 
     Raises:
       ValueError: bins that are not one-dimensional or fewer than 2.
@@ -69,7 +73,9 @@ def twohot_sparse(x: Tensor, bins: Bins) -> tuple[Tensor, Tensor]:
 
 
 def ordered_expectation(probs: Tensor, bins: Bins) -> Tensor:
-    """The mean sum(probs * bins), [..., K] and [K] -> [...]; exactly 0 for mirror-symmetric probs. [TRA-1] [TRA-10] [TRA-11] [TRA-12] [TRA-13] [TRA-14]
+    """The mean sum(probs * bins), [..., K] and [K] -> [...]; exactly 0 for mirror-symmetric probs.
+
+    [TRA-1] [TRA-10] [TRA-11] [TRA-12] [TRA-13] [TRA-14]
 
     Raises:
       ValueError: bins that are not one-dimensional, fewer than 3 or even in number, or probs of another length.

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 
 import torch
-import torch.nn.functional as F
+import torch.nn.functional as F  # noqa: N812 (so it is called everywhere)
 from torch import Tensor
 
 from impl_torch.distributions import (
@@ -64,8 +64,9 @@ def reconstruction_losses(predictions: Observations, observations: Observations,
 def world_model_losses(
     params: Params, batch: Observations, states: Mapping[str, Tensor], spaces: Spaces, config: Config
 ) -> dict[str, Tensor]:
-    """{name: [B, T]}, unweighted: "reconstruction/{key}", "reward", "continue", "dynamics", "representation". [WM-1] [WM-6] [WM-8] [WM-15] [WM-16]
+    """{name: [B, T]}, unweighted: "reconstruction/{key}", "reward", "continue", "dynamics", "representation".
 
+    [WM-1] [WM-6] [WM-8] [WM-15] [WM-16]
     batch: raw observations, "reward" and "is_terminal" [B, T]; states: what `observe` returns.
     """
     expect_keys("batch", batch, (*spaces.observations, "reward", "is_terminal"))

@@ -39,7 +39,7 @@ def core(params: Params, deter: Any, stoch: Any, action: Any, config: Config) ->
     deter = checked("deter", deter, ..., config.deter)
     rows, blocks = deter.shape[:-1], config.blocks
     stoch = checked("stoch", stoch, *rows, config.stoch, config.classes)
-    action = checked("action", action, *rows, np.shape(params["rssm/embed_action/kernel"])[0])
+    action = checked("action", action, *rows, _action_size(params))
 
     action = action / stop_gradient(np.maximum(1.0, np.abs(action)))
     flat_stoch = stoch.reshape(*rows, config.stoch * config.classes)
@@ -102,8 +102,7 @@ def posterior(params: Params, deter: Any, tokens: Any, config: Config) -> Array:
       ValueError: a shape does not fit.
     """
     deter = checked("deter", deter, ..., config.deter)
-    token_size = np.shape(params["rssm/posterior/hidden0/kernel"])[0] - config.deter
-    tokens = checked("tokens", tokens, *deter.shape[:-1], token_size)
+    tokens = checked("tokens", tokens, *deter.shape[:-1], _token_size(params, config))
     inputs = np.concatenate([deter, tokens], axis=-1)
     hidden = mlp(params, "rssm/posterior", inputs, config.posterior_layers, config.norm_epsilon)
     logits = linear(hidden, params["rssm/posterior/out/kernel"], params["rssm/posterior/out/bias"])
@@ -136,7 +135,7 @@ def observe_step(
     rows = len(is_first)
     deter = checked("carry deter", carry["deter"], rows, config.deter)
     stoch = checked("carry stoch", carry["stoch"], rows, config.stoch, config.classes)
-    prev_action = checked("prev_action", prev_action, rows, "A")
+    prev_action = checked("prev_action", prev_action, rows, _action_size(params))
     uniform = checked("uniform", uniform, rows, config.stoch)
 
     deter = np.where(is_first[:, None], 0.0, deter)
@@ -172,8 +171,8 @@ def observe(params: Params, carry: Carry, tokens: Any, prev_action: Any, is_firs
     is_first = np.asarray(is_first, dtype=bool)
     require_shape("is_first", is_first.shape, "B", "T")
     rows, steps = is_first.shape
-    tokens = checked("tokens", tokens, rows, steps, "E")
-    prev_action = checked("prev_action", prev_action, rows, steps, "A")
+    tokens = checked("tokens", tokens, rows, steps, _token_size(params, config))
+    prev_action = checked("prev_action", prev_action, rows, steps, _action_size(params))
     uniform = checked("uniform", uniform, rows, steps, config.stoch)
     require_shape("carry deter", np.shape(carry["deter"]), rows, config.deter)
     require_shape("carry stoch", np.shape(carry["stoch"]), rows, config.stoch, config.classes)
@@ -211,7 +210,7 @@ def imagine(params: Params, carry: Carry, policy: Callable[[Array, int], Any], u
     stoch = stop_gradient(checked("carry stoch", carry["stoch"], rows, config.stoch, config.classes))
     deters, stochs, actions = [deter], [stoch], []
     for t in range(horizon):
-        action = stop_gradient(checked("action of the policy", policy(feature(deter, stoch), t), rows, "A"))
+        action = stop_gradient(checked("action of the policy", policy(feature(deter, stoch), t), rows, _action_size(params)))
         deter = stop_gradient(core(params, deter, stoch, action, config))
         log_probs = unimix_log_probs(prior(params, deter, config), config.latent_unimix)
         stoch = categorical_sample(log_probs, uniform[:, t])
@@ -219,3 +218,11 @@ def imagine(params: Params, carry: Carry, policy: Callable[[Array, int], Any], u
         stochs.append(stoch)
         actions.append(action)
     return {"deter": np.stack(deters, axis=1), "stoch": np.stack(stochs, axis=1), "action": np.stack(actions, axis=1)}
+
+
+def _action_size(params: Params) -> int:
+    return np.shape(params["rssm/embed_action/kernel"])[0]
+
+
+def _token_size(params: Params, config: Config) -> int:
+    return np.shape(params["rssm/posterior/hidden0/kernel"])[0] - config.deter

@@ -32,7 +32,7 @@ class TorchAdapter:
 
     def __getattr__(self, name: str) -> Any:
         for row in ROWS:
-            function = vars(row).get(name)
+            function: Any = vars(row).get(name)
             if not name.startswith("_") and getattr(function, "__module__", None) == row.__name__:
                 return self._wrap(function, narrow=row in NARROW and name != "truncated_normal")
         raise AttributeError(name)

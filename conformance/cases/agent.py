@@ -75,7 +75,8 @@ def problem_of(run: Run, observation: str, action: str) -> Problem:
 LOSS_REQUIREMENTS = (
     *(f"AGT-{n}" for n in range(14, 28)),
     *("RET-3", "RET-4", "RET-5", "RET-6", "RET-11", "RET-15", "BEH-11", "BEH-16", "BEH-17", "BEH-18"),
-    *("WM-1", "WM-9", "WM-15", "WM-16", "CON-1", "CON-2", "CON-3", "CON-4", "CON-13", "CON-20", "CON-23", "CON-24"),
+    *("RSSM-20", "RSSM-22", "NET-1", "WM-1", "WM-6", "WM-9", "WM-15", "WM-16"),
+    *("CON-1", "CON-2", "CON-3", "CON-4", "CON-13", "CON-20", "CON-23", "CON-24"),
 )
 
 
@@ -142,8 +143,8 @@ REACHES = {
     "replay_critic": WORLD | {"critic"},
 }
 GRADIENT_REQUIREMENTS = (
-    *("AGT-28", "AGT-32", "CON-14", "CON-15", "RSSM-23", "RSSM-24", "RSSM-25", "WM-12", "WM-13", "WM-17"),
-    *("RET-18", "BEH-5", "BEH-10", "BEH-13", "BEH-15"),
+    *("AGT-28", "AGT-32", "CON-14", "CON-15", "RSSM-23", "RSSM-24", "RSSM-25", "NET-25"),
+    *("WM-1", "WM-11", "WM-12", "WM-13", "WM-14", "WM-17", "RET-18", "BEH-5", "BEH-10", "BEH-13", "BEH-15"),
 )
 
 

@@ -51,20 +51,21 @@ def impossible_classes_have_finite_gradients(run: Run) -> None:
 
 
 @check("DIS-14", "DIS-17", uses=["loss_derivatives"], level=2, dtypes=WHOLE)
-def zero_outputs_have_the_gradients_of_the_chapter(run: Run) -> None:
-    """At a logit of 0 the derivative of the continue loss is 1/2 - target, that of the reward loss is 1/K minus the two-hot target."""
+def constant_outputs_have_the_gradients_of_the_chapter(run: Run) -> None:
+    """The derivative of the continue loss is sigmoid - target at the logits 0, 800 and -800; that of the reward loss softmax - two-hot."""
     problem = make_problem(run.seed, run.profile, "vector", "discrete", run.dtype)
-    params, config = dict(problem.state["params"]), problem.config
-    for name in ("continue/out/kernel", "continue/out/bias", "reward/out/kernel", "reward/out/bias"):
-        params[name] = np.zeros_like(params[name])
-    along = run.rng().normal(size=config.bins)
+    config, along = problem.config, run.rng().normal(size=problem.config.bins)
     directions = [{"continue/out/bias": np.ones(1)}, {"reward/out/bias": along}]
-    actual = run.call("loss_derivatives", params, *problem.loss_arguments[1:], directions)
     target = continue_target(problem.batch["is_terminal"], config).mean()
     weights = twohot(problem.batch["reward"], exponential_bins(config.bins)).mean((0, 1))
-    bound = bound_of(run, 1e-8, 1e-5)
-    run.compare("derivative of continue", actual["continue"], np.array([0.5 - target, 0]), magnitude=1.0, bound=bound)
-    run.compare("derivative of reward", actual["reward"], np.array([0, (1 / config.bins - weights) @ along]), magnitude=1.0, bound=bound)
+    for logit, probability in ((0.0, 0.5), (800.0, 1.0), (-800.0, 0.0)):
+        params = dict(problem.state["params"])
+        for name in ("continue/out/kernel", "reward/out/kernel", "reward/out/bias"):
+            params[name] = np.zeros_like(params[name])
+        params["continue/out/bias"] = np.array([logit])
+        actual = run.call("loss_derivatives", params, *problem.loss_arguments[1:], directions)
+        for name, expected in (("continue", [probability - target, 0]), ("reward", [0, (1 / config.bins - weights) @ along])):
+            run.compare(f"derivative of {name}", actual[name], np.array(expected), magnitude=1.0, bound=bound_of(run, 1e-6, 1e-5))
 
 
 @functools.lru_cache(maxsize=8)

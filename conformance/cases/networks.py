@@ -7,7 +7,6 @@ from typing import Any
 import hypothesis.strategies as st
 import numpy as np
 
-from conformance.cases.agent import WHOLE, bound_of, problem_of, reference_derivatives, unit_directions
 from conformance.check import Run, check, round_to
 from conformance.problems import random_observations, random_parameters, small_config
 from conformance.strategies import adversarial_numbers, arrays, normals, seeds
@@ -102,7 +101,7 @@ def integers_of_any_kind(run: Run) -> None:
         mode = observations["mode"].astype(dtype)
         run.exact(f"tokens of {mode.dtype}", run.call("encoder", params, observations | {"mode": mode}, VECTOR_TASK, config), before)
     for real in (np.float32, np.float64):
-        run.refuses("encoder", params, observations | {"mode": observations["mode"].astype(real)}, VECTOR_TASK, config)
+        run.refuses("encoder", params, observations | {"mode": observations["mode"].astype(real)}, VECTOR_TASK, config, naming=["mode"])
 
 
 @check("NET-2", "NET-24", uses=["encoder"], level=1)
@@ -159,7 +158,8 @@ def brightness_is_scaled_in_float32(run: Run) -> None:
     params |= {name: np.zeros_like(value) for name, value in params.items() if name.startswith("encoder/image/") and name.endswith("bias")}
     observations = {"image": run.rng().integers(127, 129, (ROWS, 8, 8, 1)).astype(np.uint8)}
     expected = reference.encoder(params, observations, task, config)
-    run.expect("encoder", (params, observations, task, config), expected, magnitude="tensor")
+    bound = {"float64": 1e-11, "float32": 1e-3, "bfloat16": 0.125}[run.dtype]  # x / 255 - 1/2 loses the digits that cancel
+    run.expect("encoder", (params, observations, task, config), expected, magnitude="tensor", bound=bound)
 
 
 @check("NET-3", *(f"NET-{n}" for n in range(6, 12)), "CON-6", uses=["encoder"], level=1)
@@ -336,23 +336,6 @@ def flat(result: Any, name: str = "") -> dict[str, np.ndarray]:
     return {path: array for key, value in result.items() for path, array in flat(value, f"{name} {key}").items()}
 
 
-@check("NET-1", "NET-25", "WM-1", "WM-13", "RSSM-23", uses=["loss_derivatives"], level=2, dtypes=WHOLE)
-def gradients_reach_memory_and_latents(run: Run) -> None:
-    """Every reconstruction, the reward and the continue loss move with encoder, core and posterior, as the reference says."""
-    problem = problem_of(run, "both", "mixed")
-    directions = unit_directions(problem, run.seed)
-    labels = ("encoder", "core", "posterior")
-    index = [list(directions).index(label) for label in labels]
-    expected = reference_derivatives(run.seed, run.profile, "both", "mixed", run.dtype)
-    actual = run.call("loss_derivatives", *problem.loss_arguments, [directions[label] for label in labels])
-    for name in expected:
-        if name.startswith("reconstruction/") or name in ("reward", "continue"):
-            derivatives = expected[name][index]
-            magnitude = np.abs(derivatives).max() + 1e-3
-            run.compare(f"derivatives of {name}", actual[name], derivatives, magnitude=magnitude, bound=bound_of(run, 1e-6, 5e-3))
-            run.holds(f"{name} moves with {labels}", np.asarray(actual[name]) != 0)
-
-
 @check("NET-12", uses=["encoder"], level=1)
 def sides_that_cannot_be_halved(run: Run) -> None:
     """A height or width that is no multiple of two to the number of halvings is refused before any network runs."""
@@ -368,11 +351,13 @@ def encoder_refuses(run: Run) -> None:
     config = config_of(run)
     params, observations = params_of(run, config), observations_of(run.seed, TASK)
     for key, value in observations.items():
-        run.refuses("encoder", params, {name: x for name, x in observations.items() if name != key}, TASK, config)
-        for wrong in (value[..., :-1], value[:1], value[:2]):
-            run.refuses("encoder", params, observations | {key: wrong}, TASK, config)
+        run.refuses("encoder", params, {name: x for name, x in observations.items() if name != key}, TASK, config, naming=[key])
+        shorter = value[..., :-1]
+        run.refuses("encoder", params, observations | {key: shorter}, TASK, config, naming=[key, ", ".join(map(str, shorter.shape))])
+        for rows in (1, 2):
+            run.refuses("encoder", params, observations | {key: value[:rows]}, TASK, config)
     for dtype in (np.float32, np.int64, np.int8):
-        run.refuses("encoder", params, observations | {"image": observations["image"].astype(dtype)}, TASK, config)
+        run.refuses("encoder", params, observations | {"image": observations["image"].astype(dtype)}, TASK, config, naming=["image"])
     flipped = observations | {"image": observations["image"].swapaxes(1, 2).copy()}
     run.refuses("encoder", params, flipped, TASK, config)
 
@@ -385,7 +370,7 @@ def features_of_other_sizes_are_refused(run: Run) -> None:
     wider = dataclasses.replace(config, deter=config.deter + 2)
     for size in (config.feature_size - 1, config.feature_size + 1, 1):
         for head in HEADS:
-            run.refuses(head, params, np.zeros((ROWS, size)), config)
+            run.refuses(head, params, np.zeros((ROWS, size)), config, naming=["feature", f"{ROWS}, {size}"])
         for network in ("decoder", "actor"):
-            run.refuses(network, params, np.zeros((ROWS, size)), TASK, config)
+            run.refuses(network, params, np.zeros((ROWS, size)), TASK, config, naming=["feature", f"{ROWS}, {size}"])
     run.refuses("reward_head", params, np.zeros((ROWS, config.feature_size)), wider)

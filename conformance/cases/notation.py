@@ -267,10 +267,11 @@ def losses_refuse_other_shapes(run: Run) -> None:
     for key, value in batch.items():
         for wrong in reshapings(value):
             arguments = (params, slow_critic, return_range, {**batch, key: wrong}, noise, *rest)
-            if key in ("reward", "is_first", "is_last", "is_terminal"):  # B and T are read from one of these; then others do not fit
-                run.refuses("losses", *arguments)
-            else:
+            # B and T, or the leading axes, may be read from the wrong array, and then it is another one that does not fit.
+            if key in ("prev_action", "deter", "stoch"):
                 refuses_shape(run, "losses", arguments, key, wrong.shape)
+            else:
+                run.refuses("losses", *arguments)
     for key, value in noise.items():
         for wrong in reshapings(value):
             refuses_shape(run, "losses", (params, slow_critic, return_range, batch, {**noise, key: wrong}, *rest), key, wrong.shape)

@@ -255,7 +255,8 @@ def resets_forget_everything(run: Run) -> None:
             spoiled_carry["deter"][row] = spoiled_carry["stoch"][row] = bad
             tokens[row, :reset] = prev_action[row, : reset + 1] = bad
             uniform[row, :reset] = 1 - uniform[row, :reset]
-        after = run.call("observe", params, spoiled_carry, tokens, prev_action, is_first, uniform, config)
+        with np.errstate(invalid="ignore"):
+            after = run.call("observe", params, spoiled_carry, tokens, prev_action, is_first, uniform, config)
         for name in ("deter", "stoch", "logits"):
             for row, start in ((0, 0), (1, 2), (2, 0)):
                 run.exact(f"{name} of row {row} with {bad}", after[name][row, start:], before[name][row, start:])
@@ -307,50 +308,65 @@ def memory_is_rounded_at_every_step(run: Run) -> None:
 
 @check("RSSM-27", "CON-8", uses=["core", "prior", "posterior"], level=1)
 def steps_refuse_shapes(run: Run) -> None:
-    """Wrong sizes and different numbers of rows are refused, also where they could be broadcast."""
+    """Wrong sizes are refused, with name and shape; and different numbers of rows, also where they could be broadcast."""
     config = small_config(run.profile, run.dtype)
     D, S, C, A, E = config.deter, config.stoch, config.classes, TASK.action_size, config.units
     params = random_parameters(run.rng(), config, TASK, run.dtype)
     good = {"deter": (3, D), "stoch": (3, S, C), "action": (3, A)}
-    for name, wrong in (
-        ("deter", (3, D + 1)), ("deter", (1, D)), ("stoch", (3, S * C)), ("stoch", (3, C, S)), ("stoch", (1, S, C)),
-        ("action", (3, A - 1)), ("action", (1, A)), ("action", (A,)), ("action", (4, A)),
-    ):  # fmt: skip
-        run.refuses("core", params, *(np.zeros(shape) for shape in (good | {name: wrong}).values()), config)
-    run.refuses("prior", params, np.zeros((3, D - 1)), config)
-    for deter, tokens in (((3, D - 1), (3, E)), ((3, D), (3, E + 1)), ((3, D), (1, E)), ((3, D), (E,)), ((1, D), (3, E))):
+    sizes: tuple[tuple[str, tuple[int, ...]], ...] = (
+        ("deter", (3, D + 1)),
+        ("stoch", (3, S * C)),
+        ("stoch", (3, C, S)),
+        ("action", (3, A - 1)),
+    )
+    for name, wrong in sizes:
+        run.refuses("core", params, *map(np.zeros, (good | {name: wrong}).values()), config, naming=[name, listed(wrong)])
+    rows: tuple[tuple[str, tuple[int, ...]], ...] = (
+        ("deter", (1, D)), ("stoch", (1, S, C)), ("action", (1, A)), ("action", (A,)), ("action", (4, A)),
+    )  # fmt: skip
+    for name, wrong in rows:
+        run.refuses("core", params, *map(np.zeros, (good | {name: wrong}).values()), config)
+    run.refuses("prior", params, np.zeros((3, D - 1)), config, naming=["deter", f"3, {D - 1}"])
+    run.refuses("posterior", params, np.zeros((3, D - 1)), np.zeros((3, E)), config, naming=["deter", f"3, {D - 1}"])
+    run.refuses("posterior", params, np.zeros((3, D)), np.zeros((3, E + 1)), config, naming=["tokens", f"3, {E + 1}"])
+    for deter, tokens in (((1, D), (3, E)), ((3, D), (1, E)), ((3, D), (E,))):
         run.refuses("posterior", params, np.zeros(deter), np.zeros(tokens), config)
+
+
+def listed(shape: tuple[int, ...]) -> str:
+    """What every message about a shape must hold."""
+    return ", ".join(map(str, shape))
 
 
 @check("RSSM-27", "CON-8", uses=["observe", "imagine"], level=1)
 def sequences_refuse_shapes(run: Run) -> None:
-    """Wrong sizes and different numbers of rows or steps are refused, also where they could be broadcast."""
+    """Wrong sizes are refused by name; and different numbers of rows or steps, also where they could be broadcast."""
     config = small_config(run.profile, run.dtype)
     B, T, H, D, S, C, A, E = ROWS, STEPS, HORIZON, config.deter, config.stoch, config.classes, TASK.action_size, config.units
     params, carry, tokens, prev_action, is_first, uniform, _ = observe_arguments(run, run.seed, config)
     good = {"carry": carry, "tokens": tokens, "prev_action": prev_action, "is_first": is_first, "uniform": uniform}
-    carries: list[dict[str, tuple[int, ...]]] = [
-        {"deter": (B, D - 1)},
-        {"deter": (1, D)},
-        {"stoch": (B, S * C)},
-        {"stoch": (1, S, C)},
-        {"stoch": (B, C, S)},
-    ]
-    wrong_carries = [carry | {name: np.zeros(shape) for name, shape in shapes.items()} for shapes in carries]
-    wrong_shapes: dict[str, list[tuple[int, ...]]] = {
-        "tokens": [(B, T, E + 1), (B, T - 1, E), (1, T, E), (B, E)],
-        "prev_action": [(B, T, A - 1), (B, T + 1, A), (1, T, A), (B, T)],
-        "uniform": [(B, T, S + 1), (B, T, 1), (1, T, S), (B, T - 1, S)],
+    for name, wrong in (("tokens", (B, T, E + 1)), ("prev_action", (B, T, A - 1)), ("uniform", (B, T, S + 1)), ("uniform", (B, T, 1))):
+        run.refuses("observe", params, *(good | {name: np.zeros(wrong)}).values(), config, naming=[name])
+    lengths: dict[str, list[tuple[int, ...]]] = {
+        "tokens": [(B, T - 1, E), (1, T, E), (B, E)],
+        "prev_action": [(B, T + 1, A), (1, T, A), (B, T)],
+        "uniform": [(1, T, S), (B, T - 1, S)],
+        "is_first": [(B,), (1, T), (B, T, 1), (B, T + 1)],
     }
-    wrong: dict[str, list[Any]] = {name: [np.zeros(shape) for shape in options] for name, options in wrong_shapes.items()}
-    wrong |= {"is_first": [np.zeros(shape, bool) for shape in ((B,), (1, T), (B, T, 1), (B, T + 1))], "carry": wrong_carries}
-    for name, options in wrong.items():
-        for option in options:
-            run.refuses("observe", params, *(good | {name: option}).values(), config)
+    for name, shapes in lengths.items():  # here the message may as well name the argument that this one does not fit
+        for shape in shapes:
+            array = np.zeros(shape, bool if name == "is_first" else float)
+            run.refuses("observe", params, *(good | {name: array}).values(), config)
     action, uniform = np.zeros((B, H, A)), np.zeros((B, H, S))
-    for option in wrong_carries:
-        run.refuses("imagine", params, option, action, uniform, config)
-    for shape in ((B, H, S + 1), (B, H, 1), (1, H, S), (B, S)):
+    carries: dict[str, list[tuple[int, ...]]] = {"deter": [(B, D - 1), (1, D)], "stoch": [(B, S * C), (B, C, S), (1, S, C)]}
+    for name, shapes in carries.items():
+        for shape in shapes:
+            changed, naming = carry | {name: np.zeros(shape)}, [name, listed(shape)] if shape[0] == B else []
+            run.refuses("observe", params, *(good | {"carry": changed}).values(), config, naming=naming)
+            run.refuses("imagine", params, changed, action, uniform, config, naming=naming)
+    for shape in ((B, H, S + 1), (B, H, 1)):
+        run.refuses("imagine", params, carry, action, np.zeros(shape), config, naming=["uniform"])
+    for shape in ((B, S), (1, H, S)):
         run.refuses("imagine", params, carry, action, np.zeros(shape), config)
-    for shape in ((B, H, A + 1), (1, H, A)):
-        run.refuses("imagine", params, carry, np.zeros(shape), uniform, config)
+    run.refuses("imagine", params, carry, np.zeros((B, H, A + 1)), uniform, config)
+    run.refuses("imagine", params, carry, np.zeros((1, H, A)), uniform, config)

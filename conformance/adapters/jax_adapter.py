@@ -1,0 +1,137 @@
+"""The JAX backend as a candidate."""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from impl_jax import agent, behavior, distributions, layers, networks, optimizer, returns, rssm, transforms, world_model
+from spec import Config, Spaces
+
+ROWS = (transforms, distributions, layers, rssm, networks, world_model, returns, behavior, optimizer, agent)
+# Functions of layers whose first array is not of the compute dtype; other rows take float32 or better and convert it themselves.
+EXACT = ("truncated_normal", "dense", "mlp")
+# Run operation by operation: their Python floats would each need a compilation.
+EAGER_ROWS = (transforms, distributions)
+
+
+class JaxAdapter:
+    """Offers every public function of impl_jax under its name, NumPy in and NumPy out, compiled except for the elementwise rows."""
+
+    def __init__(self, dtype: str, device: str | None) -> None:
+        self.dtype = dtype
+        self.exact = np.dtype("float64" if dtype == "float64" else "float32")
+        self.device = jax.devices("gpu" if device == "cuda" else device)[0] if device else jax.devices()[0]
+        self.compiled: dict[Any, Callable[..., Any]] = {}
+
+    def __getattr__(self, name: str) -> Any:
+        for row in ROWS:
+            function = vars(row).get(name)
+            if function is not None and not name.startswith("_") and getattr(function, "__module__", None) == row.__name__:
+                first = jnp.bfloat16 if self.dtype == "bfloat16" and row is layers and name not in EXACT else None
+                return functools.partial(self._run, function, name, row not in EAGER_ROWS, first)
+        raise AttributeError(name)
+
+    def exponential_bins(self, bins: int) -> np.ndarray:
+        return transforms.exponential_bins(bins)
+
+    def dense(self, params: Any, name: str, x: Any, epsilon: float) -> Any:
+        return self._layers_of("dense", layers.dense, params, x, name, epsilon)
+
+    def mlp(self, params: Any, name: str, x: Any, count: int, epsilon: float) -> Any:
+        return self._layers_of("mlp", layers.mlp, params, x, name, count, epsilon)
+
+    def _layers_of(self, key: str, function: Callable[..., Any], params: Any, x: Any, name: str, *rest: Any) -> Any:
+        x = self._cast(x, jnp.bfloat16 if self.dtype == "bfloat16" else None)
+        return self._run(lambda params, x: function(params, name, x, *rest), (key, name, *rest), True, None, params, x)
+
+    def imagine(self, params: Any, carry: Any, action: Any, uniform: Any, config: Config) -> Any:
+        def function(params: Any, carry: Any, action: Any, uniform: Any, config: Config) -> Any:
+            return rssm.imagine(params, carry, lambda feature, t: action[:, t], uniform, config)
+
+        return self._run(function, "imagine", True, None, params, carry, action, uniform, config)
+
+    def laprop(self, gradient: Any, second_moment: Any, momentum: Any, step: int, config: Config) -> Any:
+        return self._run(optimizer.laprop, "laprop", True, None, gradient, second_moment, momentum, np.asarray(step, np.int32), config)
+
+    def gradients(self, params: Any, *rest: Any) -> Any:
+        def function(params: Any, *rest: Any) -> Any:
+            return jax.grad(agent.losses, has_aux=True)(params, *rest)[0]
+
+        return self._run(function, "gradients", True, None, params, *rest)
+
+    def loss_derivatives(self, *arguments: Any) -> dict[str, np.ndarray]:
+        *inputs, directions = arguments
+
+        def function(params: Any, *rest: Any) -> Any:
+            losses, pullback = jax.vjp(lambda params: agent.losses(params, *rest)[1]["losses"], params)
+            # One loss after the other: gradients [loss, ...] of every parameter.
+            rows = jnp.eye(len(losses), dtype=self.exact)
+            gradients = jax.lax.map(lambda row: pullback(dict(zip(losses, row, strict=True)))[0], rows)
+            return {name: {key: value[index] for key, value in gradients.items()} for index, name in enumerate(losses)}
+
+        gradients = self._run(function, "loss_derivatives", True, None, *inputs)
+
+        def along(gradient: Any) -> np.ndarray:
+            return np.array([sum(np.vdot(gradient[name], change) for name, change in direction.items()) for direction in directions])
+
+        return {name: along(gradient) for name, gradient in gradients.items()}
+
+    def initial_parameters(self, table: Any, uniforms: Any) -> Any:
+        return self._run(lambda uniforms: agent.initial_parameters(table, uniforms), "initial_parameters", False, None, uniforms)
+
+    def _run(self, function: Callable[..., Any], key: Any, compile_: bool, first: Any, *arguments: Any) -> Any:
+        """Calls a function with configuration, spaces and plain numbers as they are, and arrays as traced arguments."""
+        arguments = tuple(self._config(argument) for argument in arguments)
+        is_static = [isinstance(argument, str | bool | int | float | Config | Spaces) for argument in arguments]
+        dynamic = [argument for argument, static in zip(arguments, is_static, strict=True) if not static]
+        dynamic = [self._cast(argument, first if index == 0 else None) for index, argument in enumerate(dynamic)]
+
+        def call(*dynamic: Any) -> Any:
+            values = iter(dynamic)
+            return function(*(argument if static else next(values) for argument, static in zip(arguments, is_static, strict=True)))
+
+        if compile_:
+            statics = tuple(repr(argument) if static else None for argument, static in zip(arguments, is_static, strict=True))
+            call = self.compiled.setdefault((key, statics), jax.jit(call))
+        with jax.default_device(self.device):
+            return _to_numpy(call(*dynamic))
+
+    def _config(self, argument: Any) -> Any:
+        return dataclasses.replace(argument, compute_dtype=self.dtype) if isinstance(argument, Config) else argument
+
+    def _cast(self, x: Any, dtype: Any = None) -> Any:
+        """Real numbers in the dtype given, or in float32 or float64; other numbers as they are."""
+        if isinstance(x, Mapping):
+            return {name: self._cast(value, dtype) for name, value in x.items()}
+        if isinstance(x, tuple | list):
+            return tuple(self._cast(value, dtype) for value in x)
+        if isinstance(x, jax.Array):
+            return x
+        array = np.asarray(x)
+        if array.dtype.kind == "f":
+            with np.errstate(over="ignore"):
+                return jnp.asarray(array.astype(self.exact)).astype(dtype or self.exact)
+        return jnp.asarray(array, np.int32 if array.dtype.kind == "i" else array.dtype)
+
+
+def _to_numpy(x: Any) -> Any:
+    if isinstance(x, Mapping):
+        return {name: _to_numpy(value) for name, value in x.items()}
+    if isinstance(x, tuple):
+        return tuple(_to_numpy(value) for value in x)
+    if isinstance(x, float):
+        return x
+    array = np.asarray(x)
+    return array if array.dtype.kind in "iu" else array.astype(np.float64)
+
+
+def make_adapter(dtype: str, device: str | None) -> JaxAdapter:
+    """The adapter for one compute dtype; float64 switches JAX to 64-bit numbers for the whole process."""
+    if dtype == "float64":
+        jax.config.update("jax_enable_x64", True)
+    return JaxAdapter(dtype, device)
