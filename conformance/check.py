@@ -177,7 +177,7 @@ class Run:
         self.compared += expected.size
         if not expected.size:
             return
-        deviation = relative_deviation(actual, expected, magnitude, SMALLEST_NORMAL[self.dtype] / EPSILON[self.dtype])
+        deviation = relative_deviation(actual, expected, magnitude, self.tiny / self.u)
         index = np.unravel_index(np.argmax(deviation), deviation.shape)
         largest = float(deviation[index])
         share = largest / bound if bound else (0.0 if largest == 0 else math.inf)

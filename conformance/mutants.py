@@ -45,7 +45,7 @@ def mutant(explanation: str, *targets: str) -> Callable[[Function], Function]:
 @contextlib.contextmanager
 def planted(mutant: Mutant) -> Iterator[None]:
     """While this context lasts, the reference uses the wrong functions, wherever it had imported the right ones."""
-    undo: list[tuple[Any, str, Function]] = []
+    undo: list[tuple[Any, str, Any]] = []
     rows = [module for name, module in list(sys.modules.items()) if name.startswith("reference_numpy")]
     try:
         for target, replacement in mutant.replacements.items():

@@ -13,12 +13,12 @@ import numpy as np
 from conformance.check import round_to
 from spec import Config, Discrete, Image, Spaces, Vector, load_config, parameter_table
 
-OBSERVATIONS = {
+OBSERVATIONS: dict[str, dict[str, Vector | Discrete | Image]] = {
     "vector": {"position": Vector(3), "mode": Discrete((3, 2))},
     "image": {"image": Image(16, 32, 3)},
     "both": {"position": Vector(3), "mode": Discrete((3, 2)), "image": Image(16, 32, 3), "depth": Image(16, 32, 1)},
 }
-ACTIONS = {
+ACTIONS: dict[str, dict[str, Vector | Discrete]] = {
     "discrete": {"action": Discrete((4,))},
     "continuous": {"action": Vector(3)},
     "mixed": {"arm": Vector(2), "buttons": Discrete((2, 3))},

@@ -14,7 +14,7 @@ from spec import Config, Discrete, Spaces, parameter_table
 
 Arrays = Mapping[str, np.ndarray]
 
-_INITIAL, _POLICY, _TRAIN = range(3)  # streams of random numbers
+_INITIAL, _POLICY, _TRAIN, _EVALUATION = range(4)  # streams of random numbers
 
 
 class Learner:
@@ -49,16 +49,21 @@ class Learner:
         carry["action"] = jnp.zeros((envs, self.spaces.action_size), exact_dtype(config))
         return jax.device_put(carry, self._device)
 
-    def policy(self, observation: Arrays, is_first: np.ndarray, carry: Any) -> tuple[np.ndarray, Arrays, Any]:
+    def policy(
+        self, observation: Arrays, is_first: np.ndarray, carry: Any, evaluation_step: int | None = None
+    ) -> tuple[np.ndarray, Arrays, Any]:
         """One acting step of N environments. [AGT-11]
 
         observation: key -> [N, ...]; is_first [N]. Returns the flat action [N, A], the latents {"deter" [N, D], "stoch" [N, S] class
-        indices}, which may still be computing, and the new carry.
+        indices}, which may still be computing, and the new carry. With an evaluation step the random numbers are those of that step,
+        and no counter moves.
         """
         inputs = {key: np.asarray(observation[key]) for key in self.spaces.observations if key in observation}
         inputs = jax.device_put((inputs, np.asarray(is_first, bool)), self._device)
-        carry, latents = self._policy(self._state["params"], carry, *inputs, self._key, np.uint32(self._counters["policy"]))
-        self._counters["policy"] += 1
+        training = evaluation_step is None
+        stream = (_POLICY, self._counters["policy"]) if training else (_EVALUATION, evaluation_step)
+        carry, latents = self._policy(self._state["params"], carry, *inputs, self._key, np.array(stream, np.uint32))
+        self._counters["policy"] += training
         return np.asarray(carry["action"]), latents, carry
 
     def train_step(self, batch: Arrays) -> tuple[Mapping[str, Any], Arrays]:
@@ -100,10 +105,10 @@ class Learner:
         self._state = jax.device_put(_unflatten(new), self._device)
 
     def _policy_function(
-        self, params: Any, carry: Any, observation: Any, is_first: jax.Array, key: jax.Array, counter: jax.Array
+        self, params: Any, carry: Any, observation: Any, is_first: jax.Array, key: jax.Array, stream: jax.Array
     ) -> tuple[Any, Any]:
         shape = is_first.shape
-        noise = _noise(_stream(key, _POLICY, counter), {"posterior": (*shape, self.config.stoch)}, shape, self.spaces, self.config)
+        noise = _noise(_stream(key, stream[0], stream[1]), {"posterior": (*shape, self.config.stoch)}, shape, self.spaces, self.config)
         latents = {"deter": carry["deter"], "stoch": carry["stoch"]}
         latents, action = agent.policy_step(params, latents, carry["action"], observation, is_first, noise, self.spaces, self.config)
         return latents | {"action": action}, self._stored(latents)
@@ -138,7 +143,7 @@ def _find_device(name: str | None) -> jax.Device:
         raise ValueError(f"JAX finds no device {name!r} here, only {jax.default_backend()!r}; install jax[cuda12] for a GPU") from error
 
 
-def _stream(key: jax.Array, stream: int, counter: jax.Array) -> jax.Array:
+def _stream(key: jax.Array, stream: int | jax.Array, counter: jax.Array) -> jax.Array:
     return jax.random.fold_in(jax.random.fold_in(key, stream), counter)
 
 

@@ -15,7 +15,7 @@ from impl_torch.shapes import compute_dtype, wide_dtype
 from spec import Config, Discrete, Spaces, parameter_table
 
 Arrays = Mapping[str, np.ndarray]
-INITIALIZATION, POLICY, TRAIN = range(3)  # independent streams of random numbers
+INITIALIZATION, POLICY, TRAIN, EVALUATION = range(4)  # independent streams of random numbers
 
 
 class Learner:
@@ -60,11 +60,17 @@ class Learner:
 
     @torch.no_grad()
     def policy(
-        self, observation: Arrays, is_first: np.ndarray, carry: Mapping[str, Tensor]
+        self, observation: Arrays, is_first: np.ndarray, carry: Mapping[str, Tensor], evaluation_step: int | None = None
     ) -> tuple[np.ndarray, Arrays, dict[str, Tensor]]:
-        """One acting step: observation {key: [N, ...]}, is_first [N] -> (action [N, A], latents, carry). [AGT-11]"""
-        generator = self._generator(POLICY, self._policy_calls)
-        self._policy_calls += 1
+        """One acting step: observation {key: [N, ...]}, is_first [N] -> (action [N, A], latents, carry). [AGT-11]
+
+        With an evaluation step the random numbers are those of that step, and no counter moves.
+        """
+        if evaluation_step is None:
+            generator = self._generator(POLICY, self._policy_calls)
+            self._policy_calls += 1
+        else:
+            generator = self._generator(EVALUATION, evaluation_step)
         noise = {
             "posterior": self._uniform(generator, len(is_first), self.config.stoch),
             "action": self._action_noise(generator, len(is_first)),

@@ -142,16 +142,17 @@ class FakeLearner:
         return np.zeros(envs, int)
 
     def policy(
-        self, observation: Mapping[str, np.ndarray], is_first: np.ndarray, carry: Any
+        self, observation: Mapping[str, np.ndarray], is_first: np.ndarray, carry: Any, evaluation_step: int | None = None
     ) -> tuple[np.ndarray, dict[str, np.ndarray], Any]:
         """deter[0] counts the policy steps since the last reset of the row, deter[1] is the number of the call."""
         assert set(observation) == set(self._spaces.observations)
-        rng = np.random.default_rng([self._seed, self._policy_calls])
+        stream = (0, self._policy_calls) if evaluation_step is None else (1, evaluation_step)
+        rng = np.random.default_rng([self._seed, *stream])
         action = 3 * random_actions(self._spaces, rng, len(is_first))
         carry = np.where(is_first, 0, carry + 1)
         deter = np.zeros((len(is_first), self._config.deter), np.float32)
         deter[:, 0], deter[:, 1] = carry, self._policy_calls
-        self._policy_calls += 1
+        self._policy_calls += evaluation_step is None
         self.diary.append(("policy", {key: value.copy() for key, value in observation.items()}))
         return action, {"deter": deter, "stoch": np.zeros((len(is_first), self._config.stoch), np.int32)}, carry
 

@@ -29,11 +29,16 @@ class Learner(Protocol):
     def initial_carry(self, envs: int) -> Any:
         """The carry of `envs` environments before their first step; opaque to the caller."""
 
-    def policy(self, observation: Arrays, is_first: np.ndarray, carry: Any) -> tuple[np.ndarray, Arrays, Any]:
+    def policy(
+        self, observation: Arrays, is_first: np.ndarray, carry: Any, evaluation_step: int | None = None
+    ) -> tuple[np.ndarray, Arrays, Any]:
         """One acting step of N environments: [AGT] policy step.
 
         observation: key -> [N, ...]; is_first: bool [N]. Returns the flat action [N, A], the latents {"deter": [N, D] float32,
         "stoch": [N, S] class indices} and the new carry, which holds the action taken (reset wherever is_first is set next time).
+
+        evaluation_step: number of this step among those of all evaluations. It then selects the random numbers, from a stream of its
+        own, and nothing in the learner changes: evaluating leaves training as it would have been ([LOOP-18]).
         """
 
     def train_step(self, batch: Arrays) -> tuple[Mapping[str, Any], Arrays]:

@@ -52,7 +52,7 @@ def save(logdir: Path, step: int, learner: Mapping[str, Any], replay: Mapping[st
     try:
         shutil.rmtree(temporary, ignore_errors=True)
         temporary.mkdir(parents=True)
-        save_file(_contiguous(learner), temporary / "learner.safetensors")
+        save_file(_contiguous(_single_precision(learner)), temporary / "learner.safetensors")
         save_file(_contiguous(replay), temporary / "replay.safetensors")
         (temporary / "run.json").write_text(json.dumps({"format": FORMAT, **info}, indent=2) + "\n", encoding="utf-8")
         for file in temporary.iterdir():
@@ -116,6 +116,11 @@ def _entries(spaces: Mapping[str, Any]) -> dict[str, Any]:
 
 def _show(value: Any) -> str:
     return json.dumps(value) if isinstance(value, dict | list) else str(value)
+
+
+def _single_precision(arrays: Mapping[str, Any]) -> Arrays:
+    """[AGT-9]: a checkpoint is float32, also of a run that computes in float64."""
+    return {name: np.asarray(array, np.float32 if np.asarray(array).dtype == np.float64 else None) for name, array in arrays.items()}
 
 
 def _contiguous(arrays: Mapping[str, Any]) -> Arrays:

@@ -44,23 +44,25 @@ def play(envs: Environments, act: Act, episodes: int, seeds: list[int]) -> list[
 
 
 class Agent:
-    """Acts as the learner does, with a carry of its own that starts at zero."""
+    """Acts as the learner does, with a carry of its own that starts at zero. step: policy steps of all evaluations so far."""
 
-    def __init__(self, learner: Learner, envs: Environments) -> None:
+    def __init__(self, learner: Learner, envs: Environments, step: int) -> None:
+        self.step = step
         self._learner = learner
         self._carry: Any = learner.initial_carry(envs.count)
         self._keys = list(envs.spaces.observations)
 
     def __call__(self, record: Record) -> np.ndarray:
         observation = {key: record[key] for key in self._keys}
-        action, _, self._carry = self._learner.policy(observation, record["is_first"], self._carry)
+        action, _, self._carry = self._learner.policy(observation, record["is_first"], self._carry, self.step)
+        self.step += 1
         return np.asarray(action)
 
 
-def evaluate(learner: Learner, envs: Environments, episodes: int, seed: int, earlier: int) -> list[float]:
+def evaluate(agent: Agent, envs: Environments, episodes: int, seed: int, earlier: int) -> list[float]:
     """Returns of the agent as it is now, sampling its actions: [LOOP-18], [LOOP-19]. earlier: evaluations of this run before."""
     seeds = [derive_seed(seed, "evaluation_environment", worker + envs.count * earlier) for worker in range(envs.count)]
-    return play(envs, Agent(learner, envs), episodes, seeds)
+    return play(envs, agent, episodes, seeds)
 
 
 def play_randomly(envs: Environments, episodes: int, seed: int) -> list[float]:

@@ -11,7 +11,7 @@ import numpy as np
 from train import checkpoint
 from train.curve import draw_curve
 from train.errors import UserError
-from train.evaluation import evaluate
+from train.evaluation import Agent, evaluate
 from train.logger import duration
 from train.state import Run
 
@@ -100,8 +100,10 @@ def run_evaluation(run: Run) -> None:
     options, counters = run.options, run.counters
     if not options.eval_episodes or not run.test_envs:
         return
-    returns = evaluate(run.learner, run.test_envs, options.eval_episodes, options.seed, counters.evaluations)
+    agent = Agent(run.learner, run.test_envs, counters.evaluation_steps)
+    returns = evaluate(agent, run.test_envs, options.eval_episodes, options.seed, counters.evaluations)
     counters.evaluations += 1
+    counters.evaluation_steps = agent.step
     error = float(np.std(returns) / math.sqrt(len(returns)))
     run.evaluation = {"step": run.step, "return": float(np.mean(returns))}
     metrics = {"return": run.evaluation["return"], "return_standard_error": error, "return_min": min(returns), "return_max": max(returns)}

@@ -25,6 +25,7 @@ class Counters:
     starts: int = 0
     episodes: int = 0
     evaluations: int = 0
+    evaluation_steps: int = 0
     seconds: float = 0.0
 
 

@@ -51,8 +51,8 @@ def clip_extremes(run: Run) -> None:
         run.expect("adaptive_gradient_clip", (np.ones(2), parameter, 0.3, 1e-3), expected, bound=64 * run.u)
     run.exact("zero", run.call("adaptive_gradient_clip", np.zeros(3), np.zeros(3), 0.3, 1e-3), np.zeros(3))
     run.exact("clip 0", run.call("adaptive_gradient_clip", np.array([0.0, 1.0]), np.ones(2), 0.0, 1e-3), np.zeros(2))
-    for gradient, parameter in (([np.inf, 1.0], [1.0, 1.0]), ([np.nan, 1.0], [1.0, 1.0]), ([1.0, 1.0], [np.inf, 1.0])):
-        run.exact("non-finite", run.call("adaptive_gradient_clip", np.array(gradient), np.array(parameter), 0.3, 1e-3), np.full(2, np.nan))
+    for long, size in (([np.inf, 1.0], [1.0, 1.0]), ([np.nan, 1.0], [1.0, 1.0]), ([1.0, 1.0], [np.inf, 1.0])):
+        run.exact("non-finite", run.call("adaptive_gradient_clip", np.array(long), np.array(size), 0.3, 1e-3), np.full(2, np.nan))
 
 
 @check("OPT-6", uses=["learning_rate"], level=0)
@@ -186,7 +186,7 @@ def step_shows_non_finite_gradients(run: Run) -> None:
 @check("OPT-19", uses=["laprop"], level=0, dtypes=("float32", "bfloat16"))
 def optimizer_is_float32(run: Run) -> None:
     """Gradients and moments keep the precision of float32 whatever the compute dtype."""
-    x = np.float32([0.1, 0.3, 0.7]).astype(np.float64)
+    x = np.array([0.1, 0.3, 0.7], np.float32).astype(np.float64)
     config = config_of(run)
     expected = reference.laprop(x, x, x, 7, config)
     run.expect("laprop", (x, x, x, 7, config), expected, magnitude=1.0, bound=1e-5)
