@@ -14,7 +14,7 @@ test: $(VENV)/.installed
 	$(RUN)/ruff check .
 	$(RUN)/mypy
 	$(RUN)/conformance coverage
-	$(RUN)/pytest -n 2
+	$(RUN)/pytest -n 2 --dist loadgroup
 
 bench: $(VENV)/.installed
 	$(RUN)/python -m benchmarks.train_step

@@ -83,7 +83,7 @@ def test_streams_hold_every_observation_with_what_arrived_with_it(make: Make) ->
         # The latents that the policy step made for this observation: its row's steps since the reset, the number of the call.
         assert stream["deter"][:, 0].tolist() == time.tolist()
         assert stream["deter"][:, 1].tolist() == list(range(30))
-        expected = [3 * evaluation.random_actions(state.envs.spaces, np.random.default_rng([0, call]), 2)[worker] for call in range(30)]
+        expected = [3 * evaluation.random_actions(state.envs.spaces, np.random.default_rng([0, 0, call]), 2)[worker] for call in range(30)]
         assert stream["action"].tolist() == np.where((time == EPISODE)[:, None], 0, expected).tolist(), "raw, and zeros at the end"
     assert np.abs(streams[0]["action"]).max() > 1, "the test needs actions that would be clipped"
 
