@@ -237,7 +237,7 @@ class _Element:
         self._array, self._index = array, index
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
-        return np.asarray(self._array)[self._index : self._index + 1].reshape(()).astype(dtype or np.float64)
+        return np.asarray(self._array)[self._index : self._index + 1].reshape(()).astype(np.float64 if dtype is None else dtype)
 
     def __float__(self) -> float:
         return float(np.asarray(self._array)[self._index])
