@@ -85,13 +85,13 @@ def main() -> int:
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     deadline = time.monotonic() + 60 * options.minutes
-    todo = [part for part in parts(options.out, options.backends, options.device, options.small) if options.only in part[0]]
+    selected = [part for part in parts(options.out, options.backends, options.device, options.small) if options.only in part[0]]
     report: dict[str, Any] = {"accelerator": accelerator(), "machine": describe(), "parts": []}
     print(json.dumps({key: report[key] for key in ("accelerator", "machine")}))
-    for index, (name, command) in enumerate(todo):
+    for index, (name, command) in enumerate(selected):
         left = deadline - time.monotonic()
         # A part may take what is left, but leaves a third of an equal share to each part after it.
-        share = left - (len(todo) - index - 1) * left / len(todo) / 3
+        share = left - (len(selected) - index - 1) * left / len(selected) / 3
         report["parts"].append(run_part(name, command, options.out, share))
         print(json.dumps(report["parts"][-1]), flush=True)
         (options.out / "report.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
