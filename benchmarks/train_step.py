@@ -48,12 +48,12 @@ def measure(
     spaces = Spaces(OBSERVATIONS[observation], {"action": Vector(6)})
     learner = learner_class(backend)(spaces, config, seed=0, device=device)
     batch = random_batch(np.random.default_rng(0), config, spaces)
-    finish(learner.train_step(batch))
+    finish(learner.train_step(batch, 0))
     first = time.perf_counter() - start
     times = []
-    for _ in range(steps):
+    for step in range(steps):
         begin = time.perf_counter()
-        finish(learner.train_step(batch))
+        finish(learner.train_step(batch, step + 1))
         times.append(time.perf_counter() - begin)
     return {
         "backend": backend,

@@ -1,4 +1,4 @@
-"""The backend behind the interface of training: one agent, its optimizer and its random numbers, on one device."""
+"""The backend behind the interface of training: one agent and its optimizer on one device."""
 
 import math
 from collections.abc import Mapping
@@ -14,14 +14,11 @@ from spec import Config, Discrete, Spaces, parameter_table
 
 Arrays = Mapping[str, np.ndarray]
 
-_INITIAL, _POLICY, _TRAIN, _EVALUATION = range(4)  # streams of random numbers
-
 
 class Learner:
     """An agent on one device.
 
-    device: "cpu", "gpu" or "cuda"; None takes the best that JAX finds. All random numbers are a function of the seed, of the stream
-    (initialization, policy, training) and of a counter for each of the last two, which `state_dict` carries.
+    seed: of the initial parameters. device: "cpu", "gpu" or "cuda"; None takes the best that JAX finds.
 
     Raises:
       ValueError: an unknown device, or one that this installation of JAX does not have.
@@ -34,9 +31,8 @@ class Learner:
         self._device = _find_device(device)
         self.device = self._device.platform
         with jax.default_device(self._device):
-            self._key = jax.random.key(seed)
-            self._state = jax.device_put(jax.jit(_initial_state, static_argnums=1)(self._key, _Static(spaces, config)), self._device)
-        self._counters = {"policy": 0, "train": 0}
+            state = jax.jit(_initial_state, static_argnums=1)(np.uint32(seed), _Static(spaces, config))
+        self._state = jax.device_put(state, self._device)
         self._policy = jax.jit(self._policy_function)
         self._train = jax.jit(self._train_function, donate_argnums=0)
         self._batch_keys = (*spaces.observations, "reward", "is_first", "is_last", "is_terminal", "prev_action", "deter", "stoch")
@@ -49,38 +45,33 @@ class Learner:
         carry["action"] = jnp.zeros((envs, self.spaces.action_size), exact_dtype(config))
         return jax.device_put(carry, self._device)
 
-    def policy(
-        self, observation: Arrays, is_first: np.ndarray, carry: Any, evaluation_step: int | None = None
-    ) -> tuple[np.ndarray, Arrays, Any]:
+    def policy(self, observation: Arrays, is_first: np.ndarray, carry: Any, seed: int) -> tuple[np.ndarray, Arrays, Any]:
         """One acting step of N environments. [AGT-11]
 
-        observation: key -> [N, ...]; is_first [N]. Returns the flat action [N, A], the latents {"deter" [N, D], "stoch" [N, S] class
-        indices}, which may still be computing, and the new carry. With an evaluation step the random numbers are those of that step,
-        and no counter moves.
+        observation: key -> [N, ...]; is_first [N]; seed: of the random numbers. Returns the flat action [N, A], the latents
+        {"deter" [N, D], "stoch" [N, S] class indices}, which may still be computing, and the new carry.
         """
         inputs = {key: np.asarray(observation[key]) for key in self.spaces.observations if key in observation}
         inputs = jax.device_put((inputs, np.asarray(is_first, bool)), self._device)
-        training = evaluation_step is None
-        stream = (_POLICY, self._counters["policy"]) if training else (_EVALUATION, evaluation_step)
-        carry, latents = self._policy(self._state["params"], carry, *inputs, self._key, np.array(stream, np.uint32))
-        self._counters["policy"] += training
+        carry, latents = self._policy(self._state["params"], carry, *inputs, np.uint32(seed))
         return np.asarray(carry["action"]), latents, carry
 
-    def train_step(self, batch: Arrays) -> tuple[Mapping[str, Any], Arrays]:
-        """One gradient step. Returns metrics by name and the latents to write back, which may still be computing. [AGT-29], [AGT-30]"""
+    def train_step(self, batch: Arrays, seed: int) -> tuple[Mapping[str, Any], Arrays]:
+        """One gradient step with the random numbers of a seed. [AGT-29], [AGT-30]
+
+        Returns metrics by name and the latents to write back, which may still be computing.
+        """
         missing = [key for key in self._batch_keys if key not in batch]
         if missing:
             raise ValueError(f"the train batch lacks {', '.join(missing)}; it has {', '.join(sorted(batch))}")
         inputs = jax.device_put({key: batch[key] for key in self._batch_keys}, self._device)
-        self._state, metrics, latents = self._train(self._state, inputs, self._key, np.uint32(self._counters["train"]))
-        self._counters["train"] += 1
+        self._state, metrics, latents = self._train(self._state, inputs, np.uint32(seed))
         return metrics, latents
 
     def state_dict(self) -> dict[str, np.ndarray]:
-        """The training state under its canonical names, and both counters. [AGT-8], [AGT-9]"""
+        """The training state under its canonical names. [AGT-8], [AGT-9]"""
         state = {name: np.array(value) for name, value in _flatten(self._state).items()}
-        state["optimizer/step"] = state["optimizer/step"].astype(np.int64)
-        return state | {f"counters/{name}": np.array(count, np.int64) for name, count in self._counters.items()}
+        return state | {"optimizer/step": state["optimizer/step"].astype(np.int64)}
 
     def load_state_dict(self, state: Arrays) -> None:
         """Takes over a training state. [AGT-10]
@@ -89,7 +80,7 @@ class Learner:
           ValueError: a missing or unexpected name, or a wrong shape; the message lists them.
         """
         current = _flatten(self._state)
-        shapes = {name: value.shape for name, value in current.items()} | {f"counters/{name}": () for name in self._counters}
+        shapes = {name: value.shape for name, value in current.items()}
         problems = [f"missing: {name}" for name in shapes if name not in state]
         problems += [f"unexpected: {name}" for name in state if name not in shapes]
         problems += [
@@ -99,25 +90,22 @@ class Learner:
         ]
         if problems:
             raise ValueError("this training state does not fit the configuration and spaces:\n  " + "\n  ".join(problems))
-        self._counters = {name: int(state[f"counters/{name}"]) for name in self._counters}
         # Copies, because the next train step reuses the memory of the state.
         new = {name: np.array(state[name], value.dtype) for name, value in current.items()}
         self._state = jax.device_put(_unflatten(new), self._device)
 
-    def _policy_function(
-        self, params: Any, carry: Any, observation: Any, is_first: jax.Array, key: jax.Array, stream: jax.Array
-    ) -> tuple[Any, Any]:
+    def _policy_function(self, params: Any, carry: Any, observation: Any, is_first: jax.Array, seed: jax.Array) -> tuple[Any, Any]:
         shape = is_first.shape
-        noise = _noise(_stream(key, stream[0], stream[1]), {"posterior": (*shape, self.config.stoch)}, shape, self.spaces, self.config)
+        noise = _noise(seed, {"posterior": (*shape, self.config.stoch)}, shape, self.spaces, self.config)
         latents = {"deter": carry["deter"], "stoch": carry["stoch"]}
         latents, action = agent.policy_step(params, latents, carry["action"], observation, is_first, noise, self.spaces, self.config)
         return latents | {"action": action}, self._stored(latents)
 
-    def _train_function(self, state: Any, batch: Any, key: jax.Array, counter: jax.Array) -> tuple[Any, Any, Any]:
+    def _train_function(self, state: Any, batch: Any, seed: jax.Array) -> tuple[Any, Any, Any]:
         B, T = batch["is_first"].shape
         N, H, S = B * T, self.config.imagination_horizon, self.config.stoch
         uniforms = {"posterior": (B, T, S), "prior": (N, H, S)}
-        noise = _noise(_stream(key, _TRAIN, counter), uniforms, (N, H), self.spaces, self.config)
+        noise = _noise(seed, uniforms, (N, H), self.spaces, self.config)
         state, aux = agent.train_step(state, batch, noise, self.spaces, self.config)
         metrics = {f"loss/{name}": mean for name, mean in aux["losses"].items()} | aux["metrics"]
         return state, metrics, self._stored(aux)
@@ -143,26 +131,22 @@ def _find_device(name: str | None) -> jax.Device:
         raise ValueError(f"JAX finds no device {name!r} here, only {jax.default_backend()!r}; install jax[cuda12] for a GPU") from error
 
 
-def _stream(key: jax.Array, stream: int | jax.Array, counter: jax.Array) -> jax.Array:
-    return jax.random.fold_in(jax.random.fold_in(key, stream), counter)
-
-
-def _initial_state(key: jax.Array, static: _Static) -> dict[str, Any]:
+def _initial_state(seed: jax.Array, static: _Static) -> dict[str, Any]:
     table = parameter_table(static.config, static.spaces)
     kernels = {name: entry.shape for name, entry in table.items() if entry.initializer == "truncated_normal"}
     # One draw for all kernels, cut up: every draw of its own would be compiled by itself.
     ends = np.cumsum([math.prod(shape) for shape in kernels.values()])
-    numbers = jax.random.uniform(jax.random.fold_in(key, _INITIAL), (int(ends[-1]),), exact_dtype(static.config))
+    numbers = jax.random.uniform(jax.random.key(seed), (int(ends[-1]),), exact_dtype(static.config))
     pieces = zip(kernels.items(), jnp.split(numbers, ends[:-1]), strict=True)
     uniforms = {name: piece.reshape(shape) for (name, shape), piece in pieces}
     return agent.initial_state(agent.initial_parameters(table, uniforms))
 
 
 def _noise(
-    key: jax.Array, uniforms: Mapping[str, tuple[int, ...]], leading: tuple[int, ...], spaces: Spaces, config: Config
+    seed: jax.Array, uniforms: Mapping[str, tuple[int, ...]], leading: tuple[int, ...], spaces: Spaces, config: Config
 ) -> dict[str, jax.Array]:
     """Uniforms of the given shapes, and "action" [*leading, K]: normals for vectors, uniforms for categoricals. [CON-19] to [CON-21]"""
-    dtype = exact_dtype(config)
+    key, dtype = jax.random.key(seed), exact_dtype(config)
     noise = {name: jax.random.uniform(jax.random.fold_in(key, i), shape, dtype) for i, (name, shape) in enumerate(uniforms.items())}
     parts = []
     for index, space in enumerate(spaces.actions.values(), len(uniforms)):

@@ -1,4 +1,4 @@
-"""What training talks to: one agent, its optimizer and its random numbers on one device. Interface: train/backend.py."""
+"""What training talks to: one agent and its optimizer on one device. Interface: train/backend.py."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -15,21 +15,19 @@ from impl_torch.shapes import compute_dtype, wide_dtype
 from spec import Config, Discrete, Spaces, parameter_table
 
 Arrays = Mapping[str, np.ndarray]
-INITIALIZATION, POLICY, TRAIN, EVALUATION = range(4)  # independent streams of random numbers
 
 
 class Learner:
     """One agent.
 
-    All of its state lies in a few flat buffers that a train step changes in place. Random numbers are a function of the seed, of what they
-    are for and of a counter, so that a resumed run goes on as an uninterrupted one would have.
+    All of its state lies in a few flat buffers that a train step changes in place. seed: of the initial parameters.
 
     Raises:
       ValueError: a device that is unknown or not there.
     """
 
     def __init__(self, spaces: Spaces, config: Config, *, seed: int, device: str | None = None) -> None:
-        self.spaces, self.config, self.seed = spaces, config, seed
+        self.spaces, self.config = spaces, config
         self._device = select_device(device)
         self.device = str(self._device)
         if self._device.type == "cuda":
@@ -39,7 +37,7 @@ class Learner:
         self._dtype = wide_dtype(config)
         table = parameter_table(config, spaces)
         kernels = {name: entry.shape for name, entry in table.items() if entry.initializer == "truncated_normal"}
-        generator = self._generator(INITIALIZATION, 0)
+        generator = self._generator(seed)
         self.parameters = Parameters(initial_parameters(table, {name: self._uniform(generator, *shape) for name, shape in kernels.items()}))
         self._flat, self._layout = self.parameters.flat, self.parameters.layout
         self._critic_layout = Layout({name: entry.shape for name, entry in table.items() if name.startswith("critic/")})
@@ -49,7 +47,6 @@ class Learner:
         self._second_moment, self._momentum, self._gradient = (torch.zeros_like(self._flat) for _ in range(3))
         self._set_step(0)
         self._low, self._high = torch.zeros((2,), dtype=self._dtype, device=self._device).unbind()
-        self._policy_calls = self._train_steps = 0
         self._acting: Mapping[str, Tensor] | None = None  # the parameters as the policy uses them, until the next train step
 
     def initial_carry(self, envs: int) -> dict[str, Tensor]:
@@ -60,17 +57,10 @@ class Learner:
 
     @torch.no_grad()
     def policy(
-        self, observation: Arrays, is_first: np.ndarray, carry: Mapping[str, Tensor], evaluation_step: int | None = None
+        self, observation: Arrays, is_first: np.ndarray, carry: Mapping[str, Tensor], seed: int
     ) -> tuple[np.ndarray, Arrays, dict[str, Tensor]]:
-        """One acting step: observation {key: [N, ...]}, is_first [N] -> (action [N, A], latents, carry). [AGT-11]
-
-        With an evaluation step the random numbers are those of that step, and no counter moves.
-        """
-        if evaluation_step is None:
-            generator = self._generator(POLICY, self._policy_calls)
-            self._policy_calls += 1
-        else:
-            generator = self._generator(EVALUATION, evaluation_step)
+        """One acting step: observation {key: [N, ...]}, is_first [N], seed of the noise -> (action [N, A], latents, carry). [AGT-11]"""
+        generator = self._generator(seed)
         noise = {
             "posterior": self._uniform(generator, len(is_first), self.config.stoch),
             "action": self._action_noise(generator, len(is_first)),
@@ -84,20 +74,19 @@ class Learner:
         latents = {"deter": state["deter"].float().cpu().numpy(), "stoch": state["stoch"].argmax(-1).cpu().numpy()}
         return action.float().cpu().numpy(), latents, state | {"action": action}
 
-    def train_step(self, batch: Arrays) -> tuple[dict[str, Any], dict[str, Any]]:
-        """One gradient step on a replay batch: scalar metrics by name, and the latents to write back. [AGT-29] [AGT-30]"""
+    def train_step(self, batch: Arrays, seed: int) -> tuple[dict[str, Any], dict[str, Any]]:
+        """One gradient step on a replay batch, with the noise of a seed: metrics by name, latents to write back. [AGT-29] [AGT-30]"""
         config = self.config
         inputs = {name: self._to_device(x) for name, x in batch.items()}
         params = self.parameters.mapping()
         by_name, total, aux = gradients(
-            params, self._slow_critic, (self._low, self._high), inputs, self._train_noise(inputs), self.spaces, config
+            params, self._slow_critic, (self._low, self._high), inputs, self._train_noise(inputs, seed), self.spaces, config
         )
         with torch.no_grad():
             self._layout.pack(by_name.values(), out=self._gradient)
             norms, factors = flat_step_(self._optimizer, self._flat, self._gradient, self._layout, config)
             self._slow_flat.lerp_(self._critic_flat, 1 - config.slow_critic_decay)
             self._low, self._high = aux["return_range"]
-            self._train_steps += 1
             self._acting = None
             group = self._optimizer.param_groups[0]
             update = torch.linalg.vector_norm(self._momentum) * (group["lr"] / (1 - config.beta1**self._step))
@@ -118,8 +107,7 @@ class Learner:
     def state_dict(self) -> dict[str, np.ndarray]:
         """The training state under its canonical names, as copies. [AGT-8] [AGT-9]"""
         state = {name: x.detach().cpu().numpy().copy() for name, x in self._tensors().items()}
-        counters = {"optimizer/step": self._step, "counters/policy": self._policy_calls, "counters/train": self._train_steps}
-        return state | {name: np.asarray(value, np.int64) for name, value in counters.items()}
+        return state | {"optimizer/step": np.asarray(self._step, np.int64)}
 
     @torch.no_grad()
     def load_state_dict(self, state: Arrays) -> None:
@@ -129,9 +117,7 @@ class Learner:
           ValueError: a missing or unexpected name, or a wrong shape; nothing is changed then.
         """
         tensors = self._tensors()
-        shapes = {name: tuple(x.shape) for name, x in tensors.items()} | dict.fromkeys(
-            ("optimizer/step", "counters/policy", "counters/train"), ()
-        )
+        shapes: dict[str, tuple[int, ...]] = {name: tuple(x.shape) for name, x in tensors.items()} | {"optimizer/step": ()}
         problems = [f"missing {name}" for name in sorted(set(shapes) - set(state))]
         problems += [f"unexpected {name}" for name in sorted(set(state) - set(shapes))]
         for name in sorted(set(shapes).intersection(state)):
@@ -144,7 +130,6 @@ class Learner:
         for name, x in tensors.items():
             x.copy_(torch.tensor(np.asarray(state[name])))
         self._set_step(int(state["optimizer/step"]))
-        self._policy_calls, self._train_steps = int(state["counters/policy"]), int(state["counters/train"])
         self._acting = None
 
     def _tensors(self) -> dict[str, Tensor]:
@@ -171,10 +156,8 @@ class Learner:
             return tensor.pin_memory().to(self._device, non_blocking=True)
         return tensor
 
-    def _generator(self, stream: int, counter: int) -> torch.Generator:
-        """Fresh random numbers for one call. [CON-21]"""
-        seed = np.random.SeedSequence([self.seed, stream, counter]).generate_state(1, np.uint64)
-        return torch.Generator(self._device).manual_seed(int(seed[0]))
+    def _generator(self, seed: int) -> torch.Generator:
+        return torch.Generator(self._device).manual_seed(seed)
 
     def _uniform(self, generator: torch.Generator, *shape: int) -> Tensor:
         return torch.rand(*shape, generator=generator, dtype=self._dtype, device=self._device)
@@ -187,9 +170,9 @@ class Learner:
             parts.append(draw(*leading, *space.array_shape, generator=generator, dtype=self._dtype, device=self._device))
         return torch.cat(parts, -1)
 
-    def _train_noise(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def _train_noise(self, batch: Mapping[str, Tensor], seed: int) -> dict[str, Tensor]:
         """[CON-20]"""
-        generator = self._generator(TRAIN, self._train_steps)
+        generator = self._generator(seed)
         (B, T), H, S = batch["reward"].shape, self.config.imagination_horizon, self.config.stoch
         return {
             "posterior": self._uniform(generator, B, T, S),

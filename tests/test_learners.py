@@ -1,6 +1,6 @@
 """Both learners as training uses them: their state, their random numbers, and what one may take over from the other."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import jax
@@ -64,10 +64,9 @@ def fresh(backend: str) -> Arrays:
     return make(backend).state_dict()
 
 
-def middle_of_training(config: Config = CONFIG, task: Spaces = TASK, policy: int = 7, train: int = 10) -> Arrays:
+def middle_of_training(config: Config = CONFIG, task: Spaces = TASK) -> Arrays:
     """A state in which no number is zero or one."""
-    state = reference.flatten_state(random_state(np.random.default_rng(5), config, task, "float32"))
-    return {**state, "counters/policy": np.array(policy), "counters/train": np.array(train)}
+    return reference.flatten_state(random_state(np.random.default_rng(5), config, task, "float32"))
 
 
 def batch(seed: int, config: Config = CONFIG, task: Spaces = TASK) -> Arrays:
@@ -79,19 +78,19 @@ def observation(seed: int, task: Spaces = TASK) -> Arrays:
 
 
 def act(learner: Learner, first: int, calls: int) -> list[np.ndarray]:
-    """Everything that some policy steps give, beginning with fresh environments."""
+    """Everything that some policy steps give, beginning with fresh environments; the number of a step is its seed."""
     carry, results = learner.initial_carry(ENVS), []
     for call in range(first, first + calls):
-        action, latents, carry = learner.policy(observation(call), np.arange(ENVS) == call, carry)
+        action, latents, carry = learner.policy(observation(call), np.arange(ENVS) == call, carry, call)
         results += [np.array(action), *(np.array(latents[name]) for name in ("deter", "stoch"))]
     return results
 
 
 def train(learner: Learner, first: int, steps: int) -> list[np.ndarray]:
-    """Everything that some train steps give."""
+    """Everything that some train steps give; the number of a step is its seed."""
     results = []
     for step in range(first, first + steps):
-        metrics, latents = learner.train_step(batch(step))
+        metrics, latents = learner.train_step(batch(step), step)
         results += [np.array(float(metrics[name])) for name in sorted(metrics)] + [np.array(latents[name]) for name in ("deter", "stoch")]
     return results
 
@@ -120,7 +119,7 @@ def test_the_state_has_the_names_shapes_and_types_of_the_chapter(
     expected = {f"{group}/{name}": (entry.shape, "float32") for group in STATE_GROUPS for name, entry in table.items()}
     expected |= {f"slow_critic/{name}": (entry.shape, "float32") for name, entry in table.items() if name.startswith("critic/")}
     expected |= {f"return_range/{end}": ((), "float32") for end in ("low", "high")}
-    expected |= dict.fromkeys(("optimizer/step", "counters/policy", "counters/train"), ((), "int64"))
+    expected |= {"optimizer/step": ((), "int64")}
     state = make(backend, 0, task, config).state_dict()
     assert {name: (array.shape, array.dtype.name) for name, array in state.items()} == expected
     assert all(isinstance(array, np.ndarray) for array in state.values())
@@ -148,9 +147,7 @@ def test_a_fresh_state(backend: str) -> None:
             assert abs(value.mean()) < 5 * scale / value.size**0.5, name
             kernels.append(value.ravel()[:16] / scale)
     assert len(np.unique(np.round(kernels, 6))) == 16 * len(kernels), "kernels share random numbers"
-    assert [state[name] for name in ("optimizer/step", "return_range/low", "return_range/high", "counters/policy", "counters/train")] == [
-        0
-    ] * 5
+    assert [state[name] for name in ("optimizer/step", "return_range/low", "return_range/high")] == [0] * 3
 
 
 @pytest.mark.covers("AGT-8", "AGT-9", "AGT-10")
@@ -189,19 +186,10 @@ def test_states_that_do_not_fit_are_refused_and_change_nothing(learner: Learner)
     learner.load_state_dict(middle_of_training())
     state = learner.state_dict()
     wrong = {**state, "params/rssm/gru/bias": np.zeros(7, np.float32), "optimizer/step": np.zeros(1, np.int64), "params/extra": np.zeros(1)}
-    del wrong["slow_critic/critic/out/bias"], wrong["counters/train"]
+    del wrong["slow_critic/critic/out/bias"]
     with pytest.raises(ValueError) as error:  # noqa: PT011 - the words are below
         learner.load_state_dict(wrong)
-    for words in (
-        "params/rssm/gru/bias",
-        "[7]",
-        "[48]",
-        "optimizer/step",
-        "[1]",
-        "params/extra",
-        "slow_critic/critic/out/bias",
-        "counters/train",
-    ):
+    for words in ("params/rssm/gru/bias", "[7]", "[48]", "optimizer/step", "[1]", "params/extra", "slow_critic/critic/out/bias"):
         assert words in str(error.value), words
     assert "params/rssm/gru/kernel" not in str(error.value)
     assert_same_state(learner.state_dict(), state)
@@ -220,26 +208,17 @@ def test_the_same_seed_gives_the_same_run(learner: Learner, twin: Learner, fresh
     results = [[*act(one, 0, 2), *train(one, 0, 2), *act(one, 2, 2)] for one in (learner, twin)]
     assert equal(*results)
     assert_same_state(learner.state_dict(), twin.state_dict())
-    assert (learner.state_dict()["counters/policy"], learner.state_dict()["counters/train"]) == (4, 2)
 
 
 @pytest.mark.covers("CON-21", "LOOP-24")
-def test_another_seed_gives_another_run(backend: str, learner: Learner, fresh: Arrays) -> None:
-    other = make(backend, seed=1)
-    begun = other.state_dict()
+def test_another_seed_gives_other_parameters(backend: str, fresh: Arrays) -> None:
+    begun = make(backend, seed=1).state_dict()
     same = [
         name
         for name, array in fresh.items()
         if name.endswith("kernel") and name.startswith("params") and np.array_equal(array, begun[name])
     ]
     assert set(same) == {"params/reward/out/kernel", "params/critic/out/kernel"}, "only what starts as zeros"
-    # With the same parameters the noise still differs.
-    for one in (learner, other):
-        one.load_state_dict(middle_of_training())
-    (action, _, stoch), (other_action, _, other_stoch) = act(learner, 0, 1), act(other, 0, 1)
-    assert not np.array_equal(action, other_action)
-    assert not np.array_equal(stoch, other_stoch)
-    assert not np.array_equal(train(learner, 0, 1)[-1], train(other, 0, 1)[-1])
 
 
 @pytest.mark.covers("AGT-10", "LOOP-23", "LOOP-24", "LOOP-26")
@@ -256,25 +235,21 @@ def test_a_resumed_run_goes_on_as_if_it_had_not_stopped(learner: Learner, twin: 
     assert_same_state(learner.state_dict(), twin.state_dict())
 
 
-def nudge(state: Arrays, **counters: int) -> Arrays:
-    return {**state, **{f"counters/{name}": np.array(value) for name, value in counters.items()}}
-
-
 @pytest.mark.covers("CON-21", "LOOP-26")
-@pytest.mark.parametrize("counter", ["policy", "train"])
-def test_every_step_has_noise_of_its_own(learner: Learner, fresh: Arrays, counter: str) -> None:
-    """The same state and the same inputs give other samples under another number of the step, and the same under the same."""
-    run: Callable[[Learner, int, int], list[np.ndarray]] = act if counter == "policy" else train
+@pytest.mark.parametrize("step", ["policy", "train"])
+def test_every_seed_gives_noise_of_its_own(learner: Learner, fresh: Arrays, step: str) -> None:
+    """The same state and the same inputs give other samples under another seed, and the same under the same."""
     samples = []
-    for number in (0, 1, 2, 0):
-        learner.load_state_dict(nudge(fresh, **{counter: number}))
-        samples.append(run(learner, 0, 1)[-1])  # classes of the latents
+    for seed in (0, 1, 2**31 - 1, 0):
+        learner.load_state_dict(fresh)
+        if step == "policy":
+            latents = learner.policy(observation(0), np.ones(ENVS, bool), learner.initial_carry(ENVS), seed)[1]
+        else:
+            latents = learner.train_step(batch(0), seed)[1]
+        samples.append(np.array(latents["stoch"]))
     assert np.array_equal(samples[0], samples[3])
     for i, j in ((0, 1), (1, 2), (0, 2)):
         assert np.mean(samples[i] != samples[j]) > 0.5, "nearly uniform samples of 5 classes must differ in 4 of 5 places"
-    other = nudge(fresh, **{"train" if counter == "policy" else "policy": 9})
-    learner.load_state_dict(other)
-    assert np.array_equal(run(learner, 0, 1)[-1], samples[0]), "the numbers of one stream depend on the counter of the other"
 
 
 @pytest.mark.covers("CON-21")
@@ -284,7 +259,7 @@ def test_the_numbers_of_one_step_are_independent(learner: Learner, fresh: Arrays
     learner.load_state_dict({name: np.zeros_like(array) if name.startswith(outputs) else array for name, array in fresh.items()})
     envs = 512
     one = {key: np.repeat(value[:1], envs, 0) for key, value in observation(0).items()}
-    action, latents, _ = learner.policy(one, np.ones(envs, bool), learner.initial_carry(envs))
+    action, latents, _ = learner.policy(one, np.ones(envs, bool), learner.initial_carry(envs), 0)
     arm, buttons, stoch = action[:, :2], action[:, 2:], np.asarray(latents["stoch"])
     # With outputs of 0 every class is equally likely, and the normals have mean 0 and this standard deviation.
     std = CONFIG.actor_min_std + (CONFIG.actor_max_std - CONFIG.actor_min_std) / (1 + np.exp(-2))
@@ -294,7 +269,7 @@ def test_the_numbers_of_one_step_are_independent(learner: Learner, fresh: Arrays
     assert np.abs(np.mean(columns, axis=1)).max() < 5 / envs**0.5
     assert len(np.unique(arm)) == arm.size
     assert abs(np.corrcoef(arm[:-1, 0], arm[1:, 0])[0, 1]) < 5 / envs**0.5
-    _, trained = learner.train_step({key: np.repeat(value[:1], len(value), 0) for key, value in batch(0).items()})
+    _, trained = learner.train_step({key: np.repeat(value[:1], len(value), 0) for key, value in batch(0).items()}, 0)
     rows = np.asarray(trained["stoch"])
     assert not np.array_equal(rows[0], rows[1]), "rows of a batch share random numbers"
     assert len(np.unique(rows[0], axis=0)) > 2, "steps of a batch share random numbers"
@@ -329,13 +304,13 @@ def test_a_state_of_one_backend_goes_on_in_the_other() -> None:
     task, config = DECIDED_TASK, DECIDED_CONFIG
     one, other = (make(backend, seed, task, config) for seed, backend in enumerate(BACKENDS))
     one.load_state_dict(decided(config, task))
-    one.train_step(batch(0, config, task))
+    one.train_step(batch(0, config, task), 0)
     for first, second in ((one, other), (other, one)):
         state = first.state_dict()
         second.load_state_dict(state)
         assert_same_state(second.state_dict(), state)
-        inputs = batch(int(state["counters/train"]), config, task)
-        (metrics, latents), (other_metrics, other_latents) = first.train_step(inputs), second.train_step(inputs)
+        inputs = batch(int(state["optimizer/step"]), config, task)
+        (metrics, latents), (other_metrics, other_latents) = first.train_step(inputs, 1), second.train_step(inputs, 2)
         np.testing.assert_array_equal(latents["stoch"], other_latents["stoch"])
         np.testing.assert_allclose(latents["deter"], other_latents["deter"], atol=1e-5)
         for name in set(metrics).intersection(other_metrics):
@@ -344,7 +319,7 @@ def test_a_state_of_one_backend_goes_on_in_the_other() -> None:
         assert set(after) == set(other_after)
         for name, value in after.items():
             np.testing.assert_allclose(value, other_after[name], rtol=1e-3, atol=1e-3 * np.abs(value).max() + 1e-7, err_msg=name)
-        before = reference.unflatten_state({n: x for n, x in state.items() if not n.startswith("counters/")}, parameter_table(config, task))
+        before = reference.unflatten_state(state, parameter_table(config, task))
         noise = {
             "posterior": np.full((2, 5, 3), 0.3),
             "prior": np.full((10, 3, 3), 0.6),
@@ -370,7 +345,7 @@ def test_the_policy_carries_latents_and_action_and_resets_rows(decided_learner: 
     noise = {"posterior": np.full((ENVS, config.stoch), 0.5), "action": np.full((ENVS, task.action_noise_size), 0.5)}
     for step in range(4):
         is_first = np.array([step == 0] * 3 + [False] * 2 + [step == 2])
-        action, latents, carry = decided_learner.policy(observation(step), is_first, carry)
+        action, latents, carry = decided_learner.policy(observation(step), is_first, carry, step)
         expected, expected_action = reference.policy_step(
             params, expected, expected_action, observation(step), is_first, noise, task, config
         )
@@ -396,20 +371,20 @@ def test_the_first_carry_is_that_of_a_reset(learner: Learner) -> None:
     results = []
     for is_first in (True, False):
         learner.load_state_dict(middle_of_training())
-        action, latents, _ = learner.policy(observation(0), np.full(ENVS, is_first), learner.initial_carry(ENVS))
+        action, latents, _ = learner.policy(observation(0), np.full(ENVS, is_first), learner.initial_carry(ENVS), 0)
         results.append([np.array(action), np.array(latents["deter"]), np.array(latents["stoch"])])
     assert equal(*results)
 
 
 def test_what_a_learner_returns(learner: Learner) -> None:
     learner.load_state_dict(middle_of_training())
-    action, latents, _ = learner.policy(observation(0), np.zeros(ENVS, bool), learner.initial_carry(ENVS))
+    action, latents, _ = learner.policy(observation(0), np.zeros(ENVS, bool), learner.initial_carry(ENVS), 0)
     assert (action.shape, action.dtype) == ((ENVS, TASK.action_size), np.float32)
     assert (np.shape(latents["deter"]), np.asarray(latents["deter"]).dtype) == ((ENVS, CONFIG.deter), np.float32)
     assert np.shape(latents["stoch"]) == (ENVS, CONFIG.stoch)
     inputs = batch(0)
     before = {name: array.copy() for name, array in inputs.items()}
-    metrics, latents = learner.train_step(inputs)
+    metrics, latents = learner.train_step(inputs, 0)
     assert all(np.isfinite(float(value)) for value in metrics.values())
     assert {"loss/reward", "loss/actor", "loss/critic", "loss/replay_critic"} <= set(metrics)
     shape = (CONFIG.batch_size, CONFIG.batch_length)

@@ -80,10 +80,11 @@ def test_streams_hold_every_observation_with_what_arrived_with_it(make: Make) ->
         assert stream["is_first"].tolist() == (time == 0).tolist()
         assert stream["is_last"].tolist() == (time == EPISODE).tolist()
         assert stream["is_terminal"].tolist() == ((time == EPISODE) & (episode % 2 == 0)).tolist()
-        # The latents that the policy step made for this observation: its row's steps since the reset, the number of the call.
+        # The latents that the policy step made for this observation: its row's steps since the reset, the seed of the call.
+        seeds = [derive_seed(0, "policy", call) for call in range(30)]
         assert stream["deter"][:, 0].tolist() == time.tolist()
-        assert stream["deter"][:, 1].tolist() == list(range(30))
-        expected = [3 * evaluation.random_actions(state.envs.spaces, np.random.default_rng([0, 0, call]), 2)[worker] for call in range(30)]
+        assert stream["deter"][:, 1].tolist() == np.float32(seeds).tolist()
+        expected = [3 * evaluation.random_actions(state.envs.spaces, np.random.default_rng(seed), 2)[worker] for seed in seeds]
         assert stream["action"].tolist() == np.where((time == EPISODE)[:, None], 0, expected).tolist(), "raw, and zeros at the end"
     assert np.abs(streams[0]["action"]).max() > 1, "the test needs actions that would be clipped"
 
@@ -258,8 +259,27 @@ def test_a_resumed_run_goes_on_where_it_stopped(make: Make) -> None:
     streams = stored(resumed)
     assert [bool(stream["is_first"][0]) for stream in streams] == [True] * 4, "fresh resets begin new streams"
     assert sum(len(stream["reward"]) for stream in streams) == 120
-    assert resumed.learner.state_dict()["counters/policy"] == resumed.counters.policy_steps == 60
+    assert resumed.counters.policy_steps == 60
     assert sum(kind == "policy" for kind, _ in FakeLearner.diary) == 30
+
+
+@pytest.mark.covers("LOOP-24", "LOOP-25", "LOOP-26")
+def test_seeds_are_those_of_the_chapter_and_go_on_after_a_resume(make: Make) -> None:
+    FakeLearner.seeds.clear()
+    options = make(steps=40, eval_every=20, eval_episodes=2, seed=7)
+    loop.run(options, FakeLearner)
+    resumed = run_quietly(dataclasses.replace(options, steps=80))
+    seeds = FakeLearner.seeds
+    assert [seed for kind, seed in seeds if kind == "parameters"] == [derive_seed(7, "parameters", 0)] * 2
+    steps = resumed.counters.train_steps
+    assert steps > 0
+    assert [seed for kind, seed in seeds if kind == "train"] == [derive_seed(7, "train", step) for step in range(steps)]
+    acting = [seed for kind, seed in seeds if kind == "policy"]
+    training = [derive_seed(7, "policy", step) for step in range(resumed.counters.policy_steps)]
+    assert [seed for seed in acting if seed in training] == training
+    evaluating = [derive_seed(7, "evaluation", step) for step in range(resumed.counters.evaluation_steps)]
+    assert [seed for seed in acting if seed not in training] == evaluating
+    assert len(evaluating) == 3 * EPISODE
 
 
 def test_a_resumed_run_meets_new_episodes(make: Make) -> None:
@@ -363,7 +383,7 @@ def test_the_first_interrupt_saves(make: Make, monkeypatch: pytest.MonkeyPatch) 
     policy = FakeLearner.policy
 
     def interrupt(self: FakeLearner, *arguments: Any) -> Any:
-        if self._policy_calls == 20:
+        if sum(kind == "policy" for kind, _ in FakeLearner.diary) == 20:
             os.kill(os.getpid(), signal.SIGINT)
         return policy(self, *arguments)
 

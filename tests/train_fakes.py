@@ -129,51 +129,51 @@ class FakeLearner:
     """Obeys train/backend.py in NumPy: random actions, latents that say which call made them, and a diary of what it was given."""
 
     diary: ClassVar[list[tuple[str, Any]]] = []
+    seeds: ClassVar[list[tuple[str, int]]] = []
     loss: ClassVar[float] = 1.0
 
     def __init__(self, spaces: Spaces, config: Config, *, seed: int, device: str | None = None) -> None:
         if device not in (None, "cpu"):
             raise ValueError(f"no device {device!r}; available: cpu")
         self.device = "cpu"
-        self._spaces, self._config, self._seed = spaces, config, seed
-        self._policy_calls = self._train_calls = 0
+        self._spaces, self._config = spaces, config
+        self._train_steps = 0
+        self.seeds.append(("parameters", seed))
 
     def initial_carry(self, envs: int) -> Any:
         return np.zeros(envs, int)
 
     def policy(
-        self, observation: Mapping[str, np.ndarray], is_first: np.ndarray, carry: Any, evaluation_step: int | None = None
+        self, observation: Mapping[str, np.ndarray], is_first: np.ndarray, carry: Any, seed: int
     ) -> tuple[np.ndarray, dict[str, np.ndarray], Any]:
-        """deter[0] counts the policy steps since the last reset of the row, deter[1] is the number of the call."""
+        """deter[0] counts the policy steps since the last reset of the row, deter[1] is the seed."""
         assert set(observation) == set(self._spaces.observations)
-        stream = (0, self._policy_calls) if evaluation_step is None else (1, evaluation_step)
-        rng = np.random.default_rng([self._seed, *stream])
-        action = 3 * random_actions(self._spaces, rng, len(is_first))
+        action = 3 * random_actions(self._spaces, np.random.default_rng(seed), len(is_first))
         carry = np.where(is_first, 0, carry + 1)
         deter = np.zeros((len(is_first), self._config.deter), np.float32)
-        deter[:, 0], deter[:, 1] = carry, self._policy_calls
-        self._policy_calls += evaluation_step is None
+        deter[:, 0], deter[:, 1] = carry, seed
+        self.seeds.append(("policy", seed))
         self.diary.append(("policy", {key: value.copy() for key, value in observation.items()}))
         return action, {"deter": deter, "stoch": np.zeros((len(is_first), self._config.stoch), np.int32)}, carry
 
-    def train_step(self, batch: Mapping[str, np.ndarray]) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    def train_step(self, batch: Mapping[str, np.ndarray], seed: int) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         """The latents that are to be written back are 1000 + the number of the train step."""
         assert set(batch) == {*self._spaces.observations, "reward", "is_first", "is_last", "is_terminal", "prev_action", "deter", "stoch"}
-        self._train_calls += 1
+        self._train_steps += 1
+        self.seeds.append(("train", seed))
         self.diary.append(("train", {key: value.copy() for key, value in batch.items()}))
         shape = (self._config.batch_size, self._config.batch_length)
-        deter = np.full((*shape, self._config.deter), 1000 + self._train_calls, np.float32)
+        deter = np.full((*shape, self._config.deter), 1000 + self._train_steps, np.float32)
         return {"loss/total": np.float32(self.loss)}, {"deter": deter, "stoch": np.ones((*shape, self._config.stoch), np.int32)}
 
     def state_dict(self) -> dict[str, np.ndarray]:
         return {
             "params/w": np.arange(6.0, dtype=np.float32).reshape(2, 3).T,  # not contiguous
-            "counters/policy": np.array(self._policy_calls),
-            "counters/train": np.array(self._train_calls),
+            "optimizer/step": np.array(self._train_steps),
         }
 
     def load_state_dict(self, state: Mapping[str, np.ndarray]) -> None:
         if set(state) != set(self.state_dict()):
             raise ValueError(f"unexpected names {sorted(state)}")
         assert state["params/w"].tolist() == self.state_dict()["params/w"].tolist()
-        self._policy_calls, self._train_calls = int(state["counters/policy"]), int(state["counters/train"])
+        self._train_steps = int(state["optimizer/step"])

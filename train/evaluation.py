@@ -44,17 +44,22 @@ def play(envs: Environments, act: Act, episodes: int, seeds: list[int]) -> list[
 
 
 class Agent:
-    """Acts as the learner does, with a carry of its own that starts at zero. step: policy steps of all evaluations so far."""
+    """Acts as the learner does, with a carry of its own that starts at zero.
 
-    def __init__(self, learner: Learner, envs: Environments, step: int) -> None:
+    seed: of the run. step: policy steps of all its evaluations so far.
+    """
+
+    def __init__(self, learner: Learner, envs: Environments, seed: int, step: int) -> None:
         self.step = step
+        self._seed = seed
         self._learner = learner
         self._carry: Any = learner.initial_carry(envs.count)
         self._keys = list(envs.spaces.observations)
 
     def __call__(self, record: Record) -> np.ndarray:
         observation = {key: record[key] for key in self._keys}
-        action, _, self._carry = self._learner.policy(observation, record["is_first"], self._carry, self.step)
+        seed = derive_seed(self._seed, "evaluation", self.step)
+        action, _, self._carry = self._learner.policy(observation, record["is_first"], self._carry, seed)
         self.step += 1
         return np.asarray(action)
 

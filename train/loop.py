@@ -46,7 +46,8 @@ def train(run: Run) -> bool:
     with _interruptible() as interrupted:
         while run.step < options.steps and not interrupted:
             observation = {key: record[key] for key in run.envs.spaces.observations}
-            action, latents, carry = run.learner.policy(observation, record["is_first"], carry)
+            seed = derive_seed(options.seed, "policy", counters.policy_steps)
+            action, latents, carry = run.learner.policy(observation, record["is_first"], carry, seed)
             counters.policy_steps += 1
             action = _finite_action(run, action)
             run.envs.start(action)  # The environments step while the learner trains.
@@ -76,10 +77,11 @@ def remember_and_learn(run: Run, record: Record, action: np.ndarray, latents: Ma
 def learn(run: Run) -> None:
     """One train step. Its latents are written back before the next draw: until then it may still be computing."""
     write_back(run)
-    rng = np.random.Generator(np.random.PCG64(derive_seed(run.options.seed, "replay", run.counters.train_steps)))
+    seeds = {purpose: derive_seed(run.options.seed, purpose, run.counters.train_steps) for purpose in ("replay", "train")}
+    rng = np.random.Generator(np.random.PCG64(seeds["replay"]))
     batch = dict(run.replay.sample(rng.random(run.options.config.batch_size)))
     ids = batch.pop("ids")
-    metrics, latents = run.learner.train_step(batch)
+    metrics, latents = run.learner.train_step(batch, seeds["train"])
     run.counters.train_steps += 1
     run.metrics.append(metrics)
     run.pending = (ids, latents)

@@ -100,7 +100,7 @@ def run_evaluation(run: Run) -> None:
     options, counters = run.options, run.counters
     if not options.eval_episodes or not run.test_envs:
         return
-    agent = Agent(run.learner, run.test_envs, counters.evaluation_steps)
+    agent = Agent(run.learner, run.test_envs, options.seed, counters.evaluation_steps)
     returns = evaluate(agent, run.test_envs, options.eval_episodes, options.seed, counters.evaluations)
     counters.evaluations += 1
     counters.evaluation_steps = agent.step

@@ -7,7 +7,7 @@ from contextlib import ExitStack, closing
 import numpy as np
 
 from reference_numpy.replay import Replay
-from reference_numpy.training_loop import ReplayRatio
+from reference_numpy.training_loop import ReplayRatio, derive_seed
 from spec import Spaces, parameter_table
 from train import checkpoint
 from train.backend import Learner, learner_class
@@ -134,7 +134,7 @@ def _preflight(options: Options, spaces: Spaces, display: Display) -> None:
 
 def _make_learner(learner: type[Learner], options: Options, spaces: Spaces) -> Learner:
     try:
-        return learner(spaces, options.config, seed=options.seed, device=options.device)
+        return learner(spaces, options.config, seed=derive_seed(options.seed, "parameters", 0), device=options.device)
     except ValueError as error:  # Spaces and configuration have been checked: what is left is the device.
         raise UserError(f"the backend {options.backend} does not run with --device {options.device}: {error}") from error
 
