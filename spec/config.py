@@ -123,8 +123,10 @@ class Config:
             self.return_percentile_high,
             "between return_percentile_low and 100",
         )
-        for name in ("latent_unimix", "actor_unimix", "return_lambda", "slow_critic_decay", "return_decay", "beta1", "beta2"):
+        for name in ("latent_unimix", "actor_unimix", "return_lambda", "slow_critic_decay", "return_decay"):
             _require(getattr(self, name) <= 1, name, getattr(self, name), "between 0 and 1")
+        for name in ("beta1", "beta2"):
+            _require(getattr(self, name) < 1, name, getattr(self, name), "at least 0 and less than 1")
 
 
 def _require(condition: bool, name: str, value: object, expected: str) -> None:
