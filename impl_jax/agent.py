@@ -241,4 +241,4 @@ def train_step(state: State, batch: Arrays, noise: Arrays, spaces: Spaces, confi
         "optimizer": optimizer,
         "return_range": {"low": low, "high": high},
     }
-    return new, aux | {"metrics": aux["metrics"] | metrics | {"total_loss": loss}}
+    return new, aux | {"metrics": aux["metrics"] | metrics | {"loss/total": loss, "return_low": low, "return_high": high}}

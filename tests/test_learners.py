@@ -313,7 +313,8 @@ def test_a_state_of_one_backend_goes_on_in_the_other() -> None:
         (metrics, latents), (other_metrics, other_latents) = first.train_step(inputs, 1), second.train_step(inputs, 2)
         np.testing.assert_array_equal(latents["stoch"], other_latents["stoch"])
         np.testing.assert_allclose(latents["deter"], other_latents["deter"], atol=1e-5)
-        for name in set(metrics).intersection(other_metrics):
+        assert set(metrics) == set(other_metrics)
+        for name in metrics:
             np.testing.assert_allclose(float(metrics[name]), float(other_metrics[name]), rtol=2e-4, atol=2e-5, err_msg=name)
         after, other_after = first.state_dict(), second.state_dict()
         assert set(after) == set(other_after)
