@@ -1,0 +1,144 @@
+"""Trains one task with several seeds and both backends, and draws what came of it.
+
+    python -m benchmarks.learning --out FOLDER/NAME -- OPTIONS OF TRAIN
+
+Everything after `--` goes to `train` as it is. Writes NAME.json (command, machine, and the points of every curve) and NAME.png (evaluation
+returns, and a panel for each of `--metrics`). A run that is already complete in `--logdir` is not repeated.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
+
+from benchmarks.machine import describe
+from train.curve import BLUE, GRAY, ORANGE
+from train.logger import read_metrics
+
+COLORS = {"jax": BLUE, "torch": ORANGE}
+RETURN = "evaluation/return"
+
+
+def train(backend: str, seed: int, logdir: Path, arguments: list[str]) -> None:
+    """One run in a process of its own, on the cores of this thread.
+
+    Raises:
+      RuntimeError: the run failed.
+    """
+    command = [sys.executable, "-m", "train", "--backend", backend, "--seed", str(seed), "--logdir", str(logdir), *arguments]
+    logdir.mkdir(parents=True, exist_ok=True)
+    with open(logdir / "output.log", "w", encoding="utf-8") as log:
+        result = subprocess.run(command, stdout=log, stderr=log, check=False)
+    last = (logdir / "output.log").read_text(encoding="utf-8").strip().splitlines()[-1:]
+    print(f"{backend} seed {seed}: {' '.join(last)}", flush=True)
+    if result.returncode:
+        raise RuntimeError(f"{' '.join(command)}: exit code {result.returncode}; see {logdir / 'output.log'}")
+
+
+def points(logdir: Path, metrics: list[str]) -> dict[str, Any]:
+    """The curves of one run: name -> list of [step, minutes of training, value]; "random": what a random policy gets."""
+    lines = read_metrics(logdir / "metrics.jsonl")
+    curves = {
+        name: [[line["step"], round(line["seconds"] / 60, 2), float(f"{line[name]:.4g}")] for line in lines if name in line]
+        for name in (RETURN, *metrics)
+    }
+    return curves | {"random": next((line["random/return"] for line in lines if "random/return" in line), None)}
+
+
+def smooth(curve: list[list[float]], bins: int = 60) -> np.ndarray:
+    """Means over equal parts of a long curve, for the eye."""
+    values = np.array(curve)
+    return values if len(values) <= bins else np.array([part.mean(0) for part in np.array_split(values, bins)])
+
+
+def draw(path: Path, title: str, runs: list[dict[str, Any]], metrics: list[str]) -> None:
+    """Evaluations of every run (thin) with their mean per backend (thick), and the other metrics of every run."""
+    panels = [RETURN, *metrics]
+    figure = Figure(
+        figsize=(8 if len(panels) == 1 else 4.2 * min(len(panels), 3), 4.2 * -(-len(panels) // 3)), dpi=130, layout="constrained"
+    )
+    figure.suptitle(title, x=0.01, ha="left", fontsize=11)
+    for panel, axes in zip(panels, figure.subplots(-(-len(panels) // 3), min(len(panels), 3), squeeze=False).flat, strict=False):
+        for run in runs:
+            if run[panel]:
+                steps, _, values = smooth(run[panel]).T
+                axes.plot(steps, values, color=COLORS[run["backend"]], alpha=0.35 if panel == RETURN else 0.8, linewidth=1)
+        if panel == RETURN:
+            draw_means(axes, runs)
+        axes.set_ylabel("return of evaluation episodes" if panel == RETURN else panel.removeprefix("train/"))
+        axes.set_xlabel("environment steps")
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(axis="y", alpha=0.25)
+        if panel.startswith("train/loss/") and all(value > 0 for run in runs for _, _, value in run[panel]):
+            axes.set_yscale("log")
+    figure.savefig(path)
+
+
+def draw_means(axes: Axes, runs: list[dict[str, Any]]) -> None:
+    for backend, curves in by_backend(runs):
+        steps = [step for step, _, _ in curves[0]]
+        means = np.mean([[value for _, _, value in curve] for curve in curves], axis=0)
+        label = f"{backend}, mean of {len(curves)} seeds" if len(curves) > 1 else backend
+        axes.plot(steps, means, color=COLORS[backend], linewidth=2.5, marker="o", markersize=4, label=label)
+    random = [run["random"] for run in runs if run["random"] is not None]
+    if random:
+        axes.axhline(np.mean(random), color=GRAY, linestyle="--", linewidth=1.2, label=f"random policy ({np.mean(random):.4g})")
+    axes.legend(frameon=False, fontsize=9)
+    axes.set_xlim(left=0)
+
+
+def by_backend(runs: list[dict[str, Any]]) -> Iterator[tuple[str, list[list[list[float]]]]]:
+    """Each backend with the evaluations of its runs."""
+    for backend in COLORS:
+        curves = [run[RETURN] for run in runs if run["backend"] == backend]
+        if curves:
+            yield backend, curves
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True, help="path of the results without its ending")
+    parser.add_argument("--title", default="", help="title of the picture")
+    parser.add_argument("--backends", nargs="+", default=["jax", "torch"], choices=list(COLORS))
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("--metrics", nargs="*", default=[], help="metrics to draw beside the return, as train/loss/reward")
+    parser.add_argument("--jobs", type=int, default=1, help="runs at once, each with its share of the cores")
+    parser.add_argument("--logdir", type=Path, default=Path("runs/learning"), help="where the runs are kept")
+    split = sys.argv.index("--") if "--" in sys.argv else len(sys.argv)
+    options, arguments = parser.parse_args(sys.argv[1:split]), sys.argv[split + 1 :]
+
+    cores = sorted(os.sched_getaffinity(0))
+    shares = [set(cores[job :: options.jobs]) for job in range(options.jobs)]
+    free = list(shares)
+    cases = [
+        (backend, seed, options.logdir / f"{options.out.name}-{backend}-{seed}") for seed in options.seeds for backend in options.backends
+    ]
+
+    # Linux sets affinity for one thread, and processes inherit it from the thread that starts them.
+    with ThreadPoolExecutor(options.jobs, initializer=lambda: os.sched_setaffinity(0, free.pop())) as pool:
+        list(pool.map(lambda case: train(*case, arguments), cases))
+    runs = [{"backend": backend, "seed": seed, **points(logdir, options.metrics)} for backend, seed, logdir in cases]
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    command = "python -m benchmarks.learning " + " ".join(sys.argv[1:])
+    report = {"command": command, "cores_per_run": len(shares[0]), "machine": describe(), "runs": runs}
+    options.out.with_suffix(".json").write_text(json.dumps(report) + "\n", encoding="utf-8")
+    draw(options.out.with_suffix(".png"), options.title, runs, options.metrics)
+    for run in runs:
+        step, minutes, value = run[RETURN][-1]
+        print(f"{run['backend']:6} seed {run['seed']}: {value} after {step:,} steps and {minutes} minutes; random {run['random']}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
