@@ -2,9 +2,14 @@
 
 import argparse
 import importlib
+import importlib.metadata
+import json
 import sys
 import textwrap
+from collections import Counter
 from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.table import Table
@@ -36,8 +41,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     run.add_argument("--only", default="", help="only checks whose name or requirement id contains this")
     run.add_argument("--seed", type=int, default=0, help="seed of the drawn cases")
     run.add_argument("--examples", type=int, default=25, help="cases that hypothesis draws for each property")
+    run.add_argument("--json", type=Path, default=None, metavar="FILE", help="write the results to this file, too")
     commands.add_parser("coverage", help="list every requirement and what covers it; fails if one is not covered")
-    commands.add_parser("mutants", help="plant realistic mistakes in the reference one by one, and list the checks that catch each")
+    mutants = commands.add_parser(
+        "mutants", help="plant realistic mistakes in the reference one by one, and list the checks that catch each"
+    )
+    mutants.add_argument("--json", type=Path, default=None, metavar="FILE", help="write the results to this file, too")
     options = parser.parse_args(arguments)
     console = Console(width=None if sys.stdout.isatty() else 150)
     return {"run": _run, "coverage": _coverage, "mutants": _mutants}[options.command](console, options)
@@ -60,6 +69,8 @@ def _run(console: Console, options: argparse.Namespace) -> int:
             status.update(f"{number}/{len(checks)} {check.name}")
             results.append(run_check(check, adapter, options.dtype, options.profile, options.seed, options.examples))
     _print_run(console, results, options)
+    if options.json:
+        _write(options.json, run_report(results, options))
     return 0 if all(result.status in ("pass", "not offered") for result in results) and any(r.status == "pass" for r in results) else 1
 
 
@@ -91,9 +102,43 @@ def _print_run(console: Console, results: list[Result], options: argparse.Namesp
         if result.status in ("fail", "error"):
             console.print(f"[bold red]{result.check.name}[/] ({', '.join(result.check.requirements)}): {result.check.summary}")
             console.print(result.message, markup=False, highlight=False)
-    counts = {status: sum(result.status == status for result in results) for status in STYLE}
+    counts = Counter(result.status for result in results)
     numbers = sum(result.compared for result in results)
-    console.print(f"{len(results)} checks, {numbers:,} numbers compared: " + ", ".join(f"{count} {name}" for name, count in counts.items()))
+    console.print(f"{len(results)} checks, {numbers:,} numbers compared: " + ", ".join(f"{counts[name]} {name}" for name in STYLE))
+
+
+def run_report(results: list[Result], options: argparse.Namespace) -> dict[str, Any]:
+    """A run in plain JSON types: what was run, and what was found for each check and for each requirement.
+
+    `share` is the worst deviation as a share of the allowed one; it is null where what failed has no size.
+    """
+    settings = {name: getattr(options, name) for name in ("backend", "adapter", "dtype", "device", "profile", "only", "seed", "examples")}
+    checks = {result.check.name: {"status": result.status, "compared": result.compared, "message": result.message} for result in results}
+    found = {
+        row.requirement: {
+            "status": row.status,
+            "checks": [result.check.name for result in row.results],
+            "deviation": _finite(row.worst.deviation),
+            "share": _finite(row.worst.share),
+            "where": row.worst.where,
+        }
+        for row in rows(results)
+    }
+    return {**settings, "versions": _versions(), "checks": checks, "requirements": found}
+
+
+def _finite(number: float) -> float | None:
+    return float(f"{number:.3g}") if abs(number) < 1e300 else None
+
+
+def _versions() -> dict[str, str]:
+    installed = {distribution.name: distribution.version for distribution in importlib.metadata.distributions()}
+    return {name: installed[name] for name in ("dreamer-spec", "numpy", "jax", "torch") if name in installed}
+
+
+def _write(path: Path, report: dict[str, Any]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
 
 
 def _coverage(console: Console, options: argparse.Namespace) -> int:
@@ -115,21 +160,23 @@ def _coverage(console: Console, options: argparse.Namespace) -> int:
 
 
 def _mutants(console: Console, options: argparse.Namespace) -> int:
-    del options
     checks = selected_checks("float64")
     view = Table()
     for column in ("mutant", "mistake", "caught by", "first"):
         view.add_column(column, overflow="fold")
-    survivors = 0
+    caught: dict[str, dict[str, Any]] = {}
     with console.status("planting") as status:
         for number, mutant in enumerate(MUTANTS.values(), 1):
             status.update(f"{number}/{len(MUTANTS)} {mutant.name}")
             results = (run_check(check, MutantAdapter(mutant), "float64", "paper", examples=5) for check in checks)
             killers = [result.check.name for result in results if result.status in ("fail", "error")]
-            survivors += not killers
+            caught[mutant.name] = {"mistake": mutant.explanation, "caught_by": killers}
             view.add_row(mutant.name, mutant.explanation, str(len(killers)), killers[0] if killers else "[bold red]nothing")
     console.print(view)
+    survivors = sum(not entry["caught_by"] for entry in caught.values())
     console.print(f"{len(MUTANTS)} mutants, {survivors} survived")
+    if options.json:
+        _write(options.json, {"versions": _versions(), "mutants": caught})
     return 1 if survivors else 0
 
 
