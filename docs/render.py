@@ -11,6 +11,7 @@ A part stands between a marker line and an end line, and is never edited by hand
 """
 
 import ast
+import json
 import re
 import sys
 from collections.abc import Callable
@@ -20,6 +21,7 @@ from typing import Any
 from spec import benchmarks, hyperparameters, profiles, sizes
 
 ROOT = Path(__file__).resolve().parent.parent
+RESULTS = ROOT / "docs" / "results"
 PART = re.compile(r"(<!-- (quote|table): ([^>]*?) -->\n).*?(<!-- end \2 -->)", re.DOTALL)
 
 
@@ -71,13 +73,97 @@ def benchmark_table() -> str:
     return markdown_table(["suite", *names], rows)
 
 
+def conformance_runs() -> dict[tuple[str, str, str], dict[str, Any]]:
+    """The committed runs of the kit: (backend, dtype, profile) -> report of `conformance run --json`."""
+    reports = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(RESULTS.glob("conformance-*.json"))]
+    order = ("jax", "torch", "float64", "float32", "bfloat16", "paper", "official")
+    keyed = {(report["backend"], report["dtype"], report["profile"]): report for report in reports}
+    return dict(sorted(keyed.items(), key=lambda item: tuple(map(order.index, item[0]))))
+
+
+def conformance_summary() -> str:
+    """One line for each run: how many checks, and how near the worst number came to what is allowed."""
+    rows = []
+    for key, report in conformance_runs().items():
+        statuses = [entry["status"] for entry in report["checks"].values()]
+        counts = [str(statuses.count(status)) for status in ("pass", "fail", "error", "not offered")]
+        numbers = sum(entry["compared"] for entry in report["checks"].values())
+        name, worst = max(report["requirements"].items(), key=lambda item: item[1]["share"] or 0)
+        rows.append([*key, *counts, f"{numbers:,}", f"{worst['share']:.0%} ({name})"])
+    return markdown_table(
+        ["backend", "dtype", "profile", "pass", "fail", "error", "not offered", "numbers compared", "worst, of allowed"], rows
+    )
+
+
+def conformance_chapters() -> str:
+    """For each chapter the requirements that passed in float64, and the worst relative deviation."""
+    runs = {key: report for key, report in conformance_runs().items() if key[1] == "float64"}
+    prefixes = list(dict.fromkeys(name.split("-")[0] for report in runs.values() for name in report["requirements"]))
+
+    def cell(report: dict[str, Any], prefix: str) -> str:
+        entries = [entry for name, entry in report["requirements"].items() if name.split("-")[0] == prefix]
+        offered = [entry for entry in entries if entry["status"] != "not offered"]
+        if not offered:
+            return "not offered"
+        passed = sum(entry["status"] == "pass" for entry in offered)
+        return f"{passed} of {len(offered)}, {max(entry['deviation'] or 0 for entry in offered):.0e}"
+
+    rows = [[prefix, *(cell(report, prefix) for report in runs.values())] for prefix in prefixes]
+    return markdown_table(["requirements", *(f"{backend}, {profile}" for backend, _, profile in runs)], rows)
+
+
+def mutant_table() -> str:
+    """Every planted mistake and what caught it."""
+    mutants = json.loads((RESULTS / "mutants.json").read_text(encoding="utf-8"))["mutants"]
+    rows = []
+    for name, entry in mutants.items():
+        first = f"`{entry['caught_by'][0]}`" if entry["caught_by"] else "nothing"
+        rows.append([f"`{name}`", entry["mistake"], str(len(entry["caught_by"])), first])
+    return markdown_table(["mutant", "mistake", "checks that catch it", "for example"], rows)
+
+
+def train_step_table() -> str:
+    """`make bench`, one line for each case."""
+    report = json.loads((RESULTS / "train-step.json").read_text(encoding="utf-8"))
+    header = ["backend", "size", "observation", "dtype", "train step", "start to first step", "peak memory"]
+    rows = []
+    for entry in report["results"]:
+        times = [f"{entry['step_s']:.2f} s", f"{entry['first_step_s']:.0f} s", f"{entry['peak_memory_gib']:.1f} GiB"]
+        rows.append([entry[name] for name in header[:4]] + times)
+    return markdown_table(header, rows)
+
+
+def learning_table() -> str:
+    """The last evaluation of every run in the committed learning curves."""
+    rows = []
+    for path in sorted(RESULTS.glob("learning-*.json")):
+        for run in json.loads(path.read_text(encoding="utf-8"))["runs"]:
+            if run["evaluation/return"]:
+                step, minutes, value = run["evaluation/return"][-1]
+                times = f"{value / run['random']:.1f}" if run["random"] else ""
+                name = path.stem.removeprefix("learning-")
+                rows.append(
+                    [name, run["backend"], str(run["seed"]), f"{step:,}", f"{minutes:.1f}", f"{value:g}", f"{run['random']:.4g}", times]
+                )
+    return markdown_table(["curve", "backend", "seed", "steps", "minutes", "return", "random policy", "ratio"], rows)
+
+
 def _value(value: object) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     return f"{value:,}" if isinstance(value, int) else str(value)
 
 
-TABLES: dict[str, Callable[[], str]] = {"hyperparameters": hyperparameter_table, "sizes": size_table, "benchmarks": benchmark_table}
+TABLES: dict[str, Callable[[], str]] = {
+    "hyperparameters": hyperparameter_table,
+    "sizes": size_table,
+    "benchmarks": benchmark_table,
+    "conformance_summary": conformance_summary,
+    "conformance_chapters": conformance_chapters,
+    "mutants": mutant_table,
+    "train_step": train_step_table,
+    "learning": learning_table,
+}
 
 
 def render(text: str) -> str:

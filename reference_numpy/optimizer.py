@@ -64,7 +64,7 @@ def learning_rate(step: int, config: Config) -> float:
 
 
 def laprop(gradient: Any, second_moment: Any, momentum: Any, step: int, config: Config) -> tuple[Array, Array, Array]:
-    """The normalized, then averaged gradient of one tensor. Implements [OPT-8] to [OPT-14], [OPT-19], [OPT-20].
+    """The normalized, then averaged gradient of one tensor. Implements [OPT-8] to [OPT-13], [OPT-19], [OPT-20].
 
     Paper: Methods, Implementation, paragraph Optimizer; D-72, D-73.
 
@@ -78,15 +78,12 @@ def laprop(gradient: Any, second_moment: Any, momentum: Any, step: int, config: 
       The update (to be multiplied by the learning rate and subtracted), the new second moment and the new momentum, each [...].
 
     Raises:
-      ValueError: the shapes differ, the step is negative, or beta1 or beta2 is not below 1.
+      ValueError: the shapes differ, or the step is negative.
     """
     gradient = checked("gradient", gradient, ...)
     second_moment = checked("second_moment", second_moment, *gradient.shape)
     momentum = checked("momentum", momentum, *gradient.shape)
     _require_step(step)
-    for name, beta in (("beta1", config.beta1), ("beta2", config.beta2)):
-        if not 0 <= beta < 1:
-            raise ValueError(f"{name} must be at least 0 and below 1, got {beta}")
     updates = step + 1
     gradient = np.where(np.abs(gradient) < DEAD_ZONE, 0.0, gradient)
     second_moment = config.beta2 * second_moment + (1 - config.beta2) * gradient**2

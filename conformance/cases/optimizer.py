@@ -110,13 +110,6 @@ def laprop_tiny_gradients(run: Run) -> None:
     run.exact("epsilon 0", run.call("laprop", np.zeros(2), np.zeros(2), np.zeros(2), 0, no_epsilon)[0], np.zeros(2))
 
 
-@check("OPT-14", uses=["laprop"], level=0)
-def laprop_refuses_a_beta_of_one(run: Run) -> None:
-    """beta1 = 1 or beta2 = 1 is refused."""
-    for name in ("beta1", "beta2"):
-        run.refuses("laprop", np.ones(2), np.ones(2), np.ones(2), 0, config_of(run, **{name: 1.0}))
-
-
 def step_problem(run: Run) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict[str, Any], Config]:
     """Parameters of the whole table, gradients of many scales, and moments in the middle of training."""
     config = config_of(run)
