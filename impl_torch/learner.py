@@ -1,5 +1,6 @@
 """What training talks to: one agent and its optimizer on one device. Interface: train/backend.py."""
 
+import os
 from collections.abc import Mapping
 from typing import Any
 
@@ -16,6 +17,10 @@ from spec import Config, Discrete, Spaces, parameter_table
 
 Arrays = Mapping[str, np.ndarray]
 
+# Up to this many recurrent units one thread is as fast as several on a quiet machine, and many times as fast on a busy one, where each of
+# the thousands of small operations of a step would wait for the slowest thread.
+SMALL = 256
+
 
 class Learner:
     """One agent.
@@ -30,6 +35,8 @@ class Learner:
         self.spaces, self.config = spaces, config
         self._device = select_device(device)
         self.device = str(self._device)
+        if self._device.type == "cpu" and config.deter <= SMALL and "OMP_NUM_THREADS" not in os.environ:
+            torch.set_num_threads(1)
         if self._device.type == "cuda":
             # [LAY-1]: TensorFloat-32 is not float32. Convolutions would use it unasked.
             torch.set_float32_matmul_precision("highest")
