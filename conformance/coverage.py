@@ -5,7 +5,7 @@ from pathlib import Path
 
 from conformance.adapter import COLUMNS, load_adapter
 from conformance.check import CHECKS
-from conformance.execute import offered, selected_checks
+from conformance.execute import missing, selected_checks
 from conformance.requirements import requirements
 
 # Replay and the training loop are rows that both backends share: the reference's classes are the ones that the trainer uses.
@@ -27,7 +27,7 @@ def coverage() -> tuple[dict[str, dict[str, list[str]]], list[str]]:
     for requirement in requirements():
         columns = ("numpy",) if requirement.split("-")[0] in SHARED_ROWS else COLUMNS
         checks = {
-            column: [check.name for check in CHECKS.values() if requirement in check.requirements and offered(adapters[column], check)]
+            column: [check.name for check in CHECKS.values() if requirement in check.requirements and not missing(adapters[column], check)]
             for column in columns
         }
         table[requirement] = {**checks, "tests": tests.get(requirement, [])}

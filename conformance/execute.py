@@ -39,15 +39,15 @@ class Row:
         return max((result.worst for result in self.results), key=lambda worst: worst.share, default=Worst())
 
 
-def offered(adapter: object, check: Check) -> bool:
-    return all(hasattr(adapter, name) for name in check.uses)
+def missing(adapter: object, check: Check) -> list[str]:
+    """What the check needs and the adapter does not offer. A module may hold other things under such names: `from mine import losses`."""
+    return [name for name in check.uses if not callable(getattr(adapter, name, None))]
 
 
 def run_check(check: Check, adapter: object, dtype: str, profile: str, seed: int = 0, examples: int = 25) -> Result:
     """Runs one check; what the candidate raises becomes a result."""
-    if not offered(adapter, check):
-        missing = ", ".join(name for name in check.uses if not hasattr(adapter, name))
-        return Result(check, "not offered", Worst(), 0, f"the adapter does not offer {missing}")
+    if lacking := missing(adapter, check):
+        return Result(check, "not offered", Worst(), 0, f"the adapter does not offer {', '.join(lacking)}")
     run = Run(adapter, dtype, profile, seed, examples)
     try:
         check.body(run)

@@ -1,0 +1,42 @@
+"""How checks are run on what somebody hands in."""
+
+import types
+from typing import Any
+
+import numpy as np
+
+from conformance.execute import missing, run_check, selected_checks
+
+CHECKS = {check.name: check for check in selected_checks("float64")}
+
+
+def adapter(**functions: Any) -> types.ModuleType:
+    module = types.ModuleType("adapter")
+    vars(module).update(functions)
+    return module
+
+
+def test_only_callables_are_offered() -> None:
+    """`from mine import losses` puts a module under the name of a function of the interface."""
+    check = next(check for check in CHECKS.values() if "losses" in check.uses)
+    mine = adapter(losses=types.ModuleType("losses"))
+    assert "losses" in missing(mine, check)
+    assert run_check(check, mine, "float64", "paper").status == "not offered"
+    assert "losses" not in missing(adapter(losses=lambda *arguments: None), check)
+
+
+def test_what_the_candidate_raises_is_a_result() -> None:
+    def broken(x: np.ndarray) -> np.ndarray:
+        raise KeyError("oops")
+
+    result = run_check(CHECKS["transforms.symlog_matches"], adapter(symlog=broken), "float64", "paper")
+    assert result.status == "error"
+    assert "oops" in result.message
+
+
+def test_a_right_and_a_wrong_function() -> None:
+    check = CHECKS["transforms.symlog_matches"]
+    right = run_check(check, adapter(symlog=lambda x: np.sign(x) * np.log1p(np.abs(x))), "float64", "paper")
+    assert right.status == "pass", right.message
+    wrong = run_check(check, adapter(symlog=lambda x: np.sign(x) * np.log(np.abs(x))), "float64", "paper")
+    assert (wrong.status, "symlog" in wrong.message) == ("fail", True)
