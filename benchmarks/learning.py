@@ -36,10 +36,11 @@ def train(backend: str, seed: int, logdir: Path, arguments: list[str]) -> None:
       RuntimeError: the run failed.
     """
     command = [sys.executable, "-m", "train", "--backend", backend, "--seed", str(seed), "--logdir", str(logdir), *arguments]
-    if (logdir / "curve.png").exists():
+    made = logdir / "made.json"
+    if (logdir / "curve.png").exists() and made.exists() and json.loads(made.read_text(encoding="utf-8"))["arguments"] == arguments:
         return
     logdir.mkdir(parents=True, exist_ok=True)
-    (logdir / "machine.json").write_text(json.dumps(describe()), encoding="utf-8")
+    made.write_text(json.dumps({"arguments": arguments, "machine": describe()}), encoding="utf-8")
     with open(logdir / "output.log", "w", encoding="utf-8") as log:
         result = subprocess.run(command, stdout=log, stderr=log, check=False)
     last = (logdir / "output.log").read_text(encoding="utf-8").strip().splitlines()[-1:]
@@ -58,7 +59,7 @@ def points(logdir: Path, metrics: list[str]) -> dict[str, Any]:
     rounded = {
         name: [[int(step), round(minutes, 2), float(f"{value:.4g}")] for step, minutes, value in curve] for name, curve in curves.items()
     }
-    machine = json.loads((logdir / "machine.json").read_text(encoding="utf-8"))
+    machine = json.loads((logdir / "made.json").read_text(encoding="utf-8"))["machine"]
     return rounded | {"random": next((line["random/return"] for line in lines if "random/return" in line), None), "machine": machine}
 
 
@@ -102,14 +103,14 @@ def draw(path: Path, title: str, runs: list[dict[str, Any]], metrics: list[str])
 def draw_returns(axes: Axes, runs: list[dict[str, Any]]) -> None:
     for backend in COLORS:
         group = [run for run in runs if run["backend"] == backend]
-        if not group:
+        training = [np.array(run[EPISODES]) for run in group if run[EPISODES]]
+        if not training:
             continue
-        training = [np.array(run[EPISODES]).reshape(-1, 3) for run in group]
         grid = np.linspace(max(curve[0, 0] for curve in training), min(curve[-1, 0] for curve in training), 2 * BINS)
         mean = np.mean([np.interp(grid, curve[:, 0], curve[:, 2]) for curve in training], axis=0)
         seeds = f", mean of {len(group)} seeds" if len(group) > 1 else ""
         axes.plot(grid, mean, color=COLORS[backend], linewidth=2.5, label=f"{backend}, training episodes{seeds}")
-        steps, _, values = np.array([point for run in group for point in run[EVALUATION]]).T
+        steps, _, values = np.array([point for run in group for point in run[EVALUATION]]).reshape(-1, 3).T
         axes.plot(steps, values, "o", color=COLORS[backend], markersize=5, markeredgecolor="white", label=f"{backend}, evaluations")
     random = [run["random"] for run in runs if run["random"] is not None]
     if random:
@@ -130,6 +131,8 @@ def main() -> int:
     options, arguments = parser.parse_args(sys.argv[1:split]), sys.argv[split + 1 :]
 
     cores = sorted(os.sched_getaffinity(0))
+    if not 1 <= options.jobs <= len(cores):
+        parser.error(f"--jobs is {options.jobs}; expected 1 to {len(cores)}, the number of cores")
     shares = [set(cores[job :: options.jobs]) for job in range(options.jobs)]
     free = list(shares)
     cases = [
@@ -146,8 +149,8 @@ def main() -> int:
     options.out.with_suffix(".json").write_text(json.dumps(report) + "\n", encoding="utf-8")
     draw(options.out.with_suffix(".png"), options.title, runs, options.metrics)
     for run in runs:
-        step, minutes, value = run[EVALUATION][-1]
-        print(f"{run['backend']:6} seed {run['seed']}: {value} after {step:,} steps and {minutes} minutes; random {run['random']}")
+        for step, minutes, value in run[EVALUATION][-1:]:
+            print(f"{run['backend']:6} seed {run['seed']}: {value} after {step:,} steps and {minutes} minutes; random {run['random']}")
     return 0
 
 

@@ -1,6 +1,8 @@
 """Spaces, values, records and errors of the environments behind `train`."""
 
 import functools
+import os
+import signal
 import sys
 
 import gymnasium
@@ -280,6 +282,37 @@ def test_errors_come_through_worker_processes(processes: bool) -> None:
             _records_of(envs, 12)
     finally:
         envs.close()
+
+
+@pytest.mark.parametrize("victim", [0, 1])
+def test_a_worker_that_dies_is_an_error_and_no_hang(victim: int) -> None:
+    envs = Environments(functools.partial(make_env, "train_fakes:Sleepy"), 2, True)
+    envs.reset([0, 1])
+    envs.start(np.zeros((2, 2), np.float32))
+    envs._envs.processes[victim].kill()
+    with pytest.raises(UserError, match="ended unexpectedly"):
+        envs.finish()
+    envs.close()
+    assert not any(process.is_alive() for process in envs._envs.processes)
+
+
+def test_workers_outlive_the_signals_that_are_for_the_trainer() -> None:
+    """Sent to the whole process group, they must not end the workers before the trainer has saved."""
+    envs = Environments(functools.partial(make_env, "train_fakes:Counting"), 2, True)
+    envs.reset([0, 1])
+    for process in envs._envs.processes:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            os.kill(process.pid, number)
+    assert envs.step(np.zeros((2, 2), np.float32))["reward"].tolist() == [1, 1]
+    envs.close()
+
+
+def test_repeated_rewards_that_float32_cannot_hold_are_refused() -> None:
+    env = ContractEnv(train_fakes.Faulty(1, reward=3e38), "t", action_repeat=2)
+    env._env.step = lambda action: (np.zeros(2, np.float32), 3e38, False, False, {})
+    env.reset()
+    with pytest.raises(UserError, match="2 repeated actions add up"):
+        env.step(np.zeros(2, np.float32))
 
 
 def test_errors_of_the_environments_own_code_keep_their_traceback() -> None:
