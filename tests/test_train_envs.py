@@ -443,3 +443,13 @@ def test_dm_control_from_vectors() -> None:
     assert 0 < reward <= 2
     with pytest.raises(UserError, match="known: cartpole-balance"):
         make_env("dmc:cartpole-fly")
+
+
+@pytest.mark.covers("LOOP-27")
+def test_every_repeat_gets_the_same_action() -> None:
+    """`Counting` writes into the actions that it is given."""
+    inner = train_fakes.Counting()
+    env = ContractEnv(inner, "t", action_repeat=3)
+    env.reset()
+    env.step(np.float32([0.0, 0.5]))
+    assert [action.tolist() for action in inner.actions] == [[5, 0.5]] * 3

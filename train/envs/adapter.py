@@ -49,11 +49,10 @@ class ContractEnv(gymnasium.Env[Observation, np.ndarray]):
         return self._observation(value[0]), {}
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        env_action = self._translation.action(action)
         total = 0.0
         for _ in range(self._action_repeat):
             self._steps += 1
-            value = self._call(self._env.step, env_action)
+            value = self._call(self._env.step, self._translation.action(action))  # Made anew: an environment may write into it.
             if not isinstance(value, tuple) or len(value) != 5:
                 raise self._error(
                     f"step returned {_describe(value)}; Gymnasium's step returns (observation, reward, terminated, truncated, info)"
