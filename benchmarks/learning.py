@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter
+from matplotlib.ticker import EngFormatter, FormatStrFormatter
 
 from benchmarks.machine import describe
 from train.curve import BLUE, GRAY, ORANGE
@@ -76,19 +76,26 @@ def means(curve: np.ndarray) -> np.ndarray:
 
 
 def draw(path: Path, title: str, runs: list[dict[str, Any]], metrics: list[str]) -> None:
-    """Returns of training episodes of every run (thin) and their mean per backend (thick), evaluations (dots), and the other metrics."""
-    panels = [EPISODES, *metrics]
-    figure = Figure(
-        figsize=(8 if len(panels) == 1 else 4.2 * min(len(panels), 3), 4.2 * -(-len(panels) // 3)), dpi=130, layout="constrained"
-    )
+    """Returns of training episodes of every run (thin) and their mean per backend (thick), evaluations (dots), and the other metrics.
+
+    A run that is shorter than its first episode has no returns to draw.
+    """
+    panels = [name for name in (EPISODES, *metrics) if any(run[name] for run in runs)]
+    columns, rows = min(len(panels), 3), -(-len(panels) // 3)
+    figure = Figure(figsize=(8 if len(panels) == 1 else 4.2 * columns, 4.2 * rows), dpi=130, layout="constrained")
     figure.suptitle(title, x=0.01, ha="left", fontsize=11)
-    for panel, axes in zip(panels, figure.subplots(-(-len(panels) // 3), min(len(panels), 3), squeeze=False).flat, strict=False):
+    grid = figure.subplots(rows, columns, squeeze=False).flat
+    for axes in grid[len(panels) :]:
+        axes.set_visible(False)
+    for panel, axes in zip(panels, grid, strict=False):
         for run in runs:
             if run[panel]:
                 steps, _, values = np.array(run[panel]).T
-                axes.plot(steps, values, color=COLORS[run["backend"]], alpha=0.35 if panel == EPISODES else 0.8, linewidth=1)
+                label = None if panel == EPISODES else f"{run['backend']}, seed {run['seed']}"
+                axes.plot(steps, values, color=COLORS[run["backend"]], alpha=0.35 if panel == EPISODES else 0.8, linewidth=1, label=label)
         if panel == EPISODES:
             draw_returns(axes, runs)
+        if panel == panels[0]:
             figure.legend(*axes.get_legend_handles_labels(), frameon=False, fontsize=9, loc="outside lower center", ncols=3)
         axes.set_ylabel("return" if panel == EPISODES else panel.removeprefix("train/"))
         axes.set_xlabel("environment steps")
@@ -97,6 +104,8 @@ def draw(path: Path, title: str, runs: list[dict[str, Any]], metrics: list[str])
         axes.grid(axis="y", alpha=0.25)
         if panel.startswith("train/loss/") and all(value > 0 for run in runs for _, _, value in run[panel]):
             axes.set_yscale("log")
+            for ticks in (axes.yaxis.set_major_formatter, axes.yaxis.set_minor_formatter):
+                ticks(FormatStrFormatter("%g"))
     figure.savefig(path)
 
 
