@@ -12,7 +12,7 @@ from unittest import mock
 
 import hypothesis.strategies as st
 import numpy as np
-from hypothesis import HealthCheck, settings
+from hypothesis import HealthCheck, Phase, settings
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule, run_state_machine_as_test
 
 from reference_numpy.replay import Replay as Naive
@@ -84,7 +84,8 @@ class ReplayMachine(RuleBasedStateMachine):
 
     def __init__(self) -> None:
         super().__init__()
-        self.root = Path(tempfile.mkdtemp(prefix="replay-machine-"))
+        memory = Path("/dev/shm")  # Where it is, a flush costs nothing.
+        self.root = Path(tempfile.mkdtemp(prefix="replay-machine-", dir=memory if memory.is_dir() else None))
 
     def teardown(self) -> None:
         shutil.rmtree(self.root)
@@ -227,8 +228,10 @@ class ReplayMachine(RuleBasedStateMachine):
             assert len(self.replay) == len(self.naive)
 
 
-def run_machine(examples: int, steps: int = 40) -> None:
+def run_machine(examples: int, steps: int = 40, shrink: bool = True) -> None:
     """Runs the machine on histories that are the same every time.
+
+    shrink: whether to look for a shorter history that fails too.
 
     Raises:
       whatever shows that the buffer is wrong.
@@ -241,6 +244,7 @@ def run_machine(examples: int, steps: int = 40) -> None:
             stateful_step_count=steps,
             deadline=None,
             database=None,
+            phases=(Phase.generate, Phase.shrink) if shrink else (Phase.generate,),
             derandomize=True,
             report_multiple_bugs=False,
             suppress_health_check=quiet,

@@ -1,8 +1,8 @@
 """The buffer of a run against the naive one, and mistakes in it that the comparison catches."""
 
 import pytest
-
-from tests.replay_machine import run_machine
+from replay_machine import run_machine
+from replay_mistakes import MISTAKES, Mistake
 
 
 def test_the_buffer_is_the_naive_one() -> None:
@@ -12,3 +12,13 @@ def test_the_buffer_is_the_naive_one() -> None:
 @pytest.mark.slow
 def test_the_buffer_is_the_naive_one_in_many_histories() -> None:
     run_machine(examples=3000, steps=80)
+
+
+@pytest.mark.parametrize("mistake", MISTAKES, ids=lambda mistake: mistake.explanation.replace(" ", "_"))
+def test_the_mistake_is_caught(mistake: Mistake, monkeypatch: pytest.MonkeyPatch) -> None:
+    mistake.plant(monkeypatch)
+    try:
+        run_machine(examples=300, shrink=False)
+    except Exception:
+        return
+    pytest.fail(f"the machine did not notice: {mistake.explanation}")
