@@ -138,6 +138,12 @@ class ReplayMachine(RuleBasedStateMachine):
         assert_same(batch, self.naive.sample(uniform, online))
         self.drawn.append(batch["ids"])
 
+    @precondition(lambda self: len(self.naive))
+    @rule(seed=SEEDS, rows=st.integers(1, 6))
+    def train(self, seed: int, rows: int) -> None:
+        self.sample(seed, rows, True)
+        self.write_back(seed, 0)
+
     @rule(seed=SEEDS, which=st.integers(0, 3))
     def write_back(self, seed: int, which: int) -> None:
         ids = self.drawn[max(0, len(self.drawn) - 1 - which)]
@@ -152,7 +158,7 @@ class ReplayMachine(RuleBasedStateMachine):
             actual, expected = ({key: value for key, value in state.items() if "/" not in key} for state in (actual, expected))
         assert_same(actual, expected)
 
-    @rule(kept=st.integers(1, 3))
+    @rule(kept=st.sampled_from([3, 2, 1]))
     def save(self, kept: int) -> None:
         name = f"step {self.count}"
         description = self.replay.save(name)
@@ -177,17 +183,27 @@ class ReplayMachine(RuleBasedStateMachine):
         self.replay.load_state_dict(self.replay.state_dict())
         self.naive.load_state_dict(self.naive.state_dict())
 
-    @precondition(lambda self: self.saves)
     @rule(
+        lives=st.lists(st.sampled_from(["train", "save"]), max_size=6),
         which=st.integers(0, 2),
         continue_streams=st.booleans(),
         during=st.sampled_from(["nothing", "add", "write_back", "save", "keep", "restore"]),
         at=st.integers(1, 12),
         seed=SEEDS,
         copied=st.booleans(),
+        again=st.booleans(),
     )
-    def crash(self, which: int, continue_streams: bool, during: str, at: int, seed: int, copied: bool) -> None:
-        """The process dies while it does something, and one of the saves is restored: the last, if it is not damaged."""
+    def crash(
+        self, lives: list[str], which: int, continue_streams: bool, during: str, at: int, seed: int, copied: bool, again: bool
+    ) -> None:
+        """After some more life the process dies while it does something; one of the saves is restored: the last, if it is not damaged."""
+        for number, what in enumerate(["save", *lives] if not self.saves else lives):
+            if what == "save":
+                self.save(3)
+            else:
+                self.add_batch(seed + number, 1)
+                if len(self.naive):
+                    self.train(seed + number, 3)
         which = min(which, len(self.saves) - 1)
         self.saves = self.saves[: len(self.saves) - which]
         name, description, naive = self.saves[-1]
@@ -196,12 +212,15 @@ class ReplayMachine(RuleBasedStateMachine):
             self.die(during, seed, description, continue_streams)
         if copied:
             directory = Path(shutil.copytree(directory, self.new_directory()))
-        self.replay = Replay.restore(directory, description, self.capacity, self.length, continue_streams=continue_streams, **self.settings)
+        for _ in range(1 + again):
+            self.replay = self.restored(directory, description, continue_streams)
         assert self.replay.warnings == []
         self.naive = copy.deepcopy(naive)
         if not continue_streams:
             self.naive.load_state_dict(self.naive.state_dict())
         self.compare_everything()
+        if len(self.naive):
+            self.sample(seed, 5, True)
 
     def die(self, during: str, seed: int, description: dict[str, Any], continue_streams: bool) -> None:
         rng = np.random.default_rng(seed)
@@ -219,8 +238,10 @@ class ReplayMachine(RuleBasedStateMachine):
         elif during == "keep":
             self.replay.keep([name for name, _, _ in self.saves])
         elif during == "restore":
-            directory = self.replay.directory
-            Replay.restore(directory, description, self.capacity, self.length, continue_streams=continue_streams, **self.settings)
+            self.restored(self.replay.directory, description, continue_streams)
+
+    def restored(self, directory: Path, description: dict[str, Any], continue_streams: bool) -> Replay:
+        return Replay.restore(directory, description, self.capacity, self.length, continue_streams=continue_streams, **self.settings)
 
     @invariant()
     def same_length(self) -> None:

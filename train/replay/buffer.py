@@ -135,7 +135,9 @@ class Replay:
             self.add_packed(packed, row, worker)
 
     def pack(self, steps: Mapping[str, Any]) -> Packed:
-        """Records of N workers, every entry [N, ...], checked and converted at once; `add_packed` adds them one by one.
+        """Records of N workers, every entry [N, ...], checked and converted at once; `add_packed` adds them one by one and copies.
+
+        What is returned may share memory with `steps`: add it before they change.
 
         Raises:
           ValueError: as `add`.

@@ -28,6 +28,7 @@ from train.replay.layout import Layout, Sections
 PAGE = 4096
 MAGIC = "dreamer-spec replay chunk"
 FORMAT = 1
+SPARE = 32  # files that wait to be used again
 
 
 @dataclasses.dataclass
@@ -88,6 +89,7 @@ class ChunkStore:
     def __init__(self, directory: Path, shape: Shape, memory_limit: int) -> None:
         self.directory, self.shape, self.memory_limit = directory, shape, memory_limit
         self._open: collections.OrderedDict[int, OpenChunk] = collections.OrderedDict()
+        self._spare: list[Path] = []
         descriptors = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
         # A mapping holds a descriptor too, and half of them stay free for others.
         self._most_open = max(1, min(memory_limit // shape.file_bytes, max(descriptors, 64) // 4))
@@ -101,13 +103,18 @@ class ChunkStore:
         return chunk_path(self.directory, number)
 
     def create(self, number: int) -> None:
-        """Makes an empty chunk file; an interrupted one leaves nothing.
+        """Makes a chunk file without records, of one that is not needed any more if there is one: its blocks are taken already.
 
         Raises:
-          UserError: the disk is full or refuses it.
+          UserError: the disk is full or refuses it; nothing is left behind.
         """
         path = self.path(number)
         with disk_errors(self.directory):
+            if self._spare:
+                with self._spare[-1].open("rb+", buffering=0) as file:
+                    write_all(file.fileno(), self.shape.header(number), 0)
+                self._spare.pop().rename(path)
+                return
             fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o644)
             try:
                 reserve(fd, self.shape.file_bytes)
@@ -156,6 +163,13 @@ class ChunkStore:
 
     def close(self, number: int) -> None:
         self._open.pop(number, None)
+
+    def discard(self, number: int) -> None:
+        """Gives up a chunk file: it becomes another one, or goes."""
+        if len(self._spare) < SPARE:
+            self._spare.append(self.path(number))
+        else:
+            self.path(number).unlink(missing_ok=True)
 
     def problem(self, number: int) -> str | None:
         """What is wrong with the file as such, or None."""

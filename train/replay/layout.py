@@ -86,7 +86,7 @@ class Layout:
         """Sections of N records.
 
         Args:
-          steps: every entry as [N, ...]; copied.
+          steps: every entry as [N, ...]. The result may share their memory: it is to be used before they change.
 
         Raises:
           ValueError: an entry is missing or unknown, or differs in shape or kind from the layout; a class index is out of range.
@@ -106,7 +106,7 @@ class Layout:
         rows = np.zeros(count, self.rows_dtype)
         for key in self.rows_dtype.names or ():
             rows[key] = values[key]
-        large = [as_bytes(np.array(values[key], self.entries[key][0], order="C")) for key in self.large]
+        large = [as_bytes(np.ascontiguousarray(values[key], self.entries[key][0])) for key in self.large]
         return [as_bytes(rows), *large, self.pack_latents(values["deter"], values["stoch"])]
 
     def require_indices(self, name: str, stoch: NDArray[Any]) -> None:

@@ -108,7 +108,7 @@ class Storage:
                 self.dirty.pop(chunk.number, None)
                 self.store.close(chunk.number)
                 if self.history.retire(chunk.number):
-                    self.store.path(chunk.number).unlink(missing_ok=True)
+                    self.store.discard(chunk.number)
 
     def _begin_block(self, stream: Stream, position: int) -> None:
         self.write_stage(stream)
@@ -121,7 +121,10 @@ class Storage:
                 block_sums=np.zeros(self.records // self.block, np.uint32),
             )
             stream.chunks[position // self.records] = chunk
-        stream.stage = Stage(position, [np.zeros((self.block, size), np.uint8) for size in self.layout.section_bytes])
+        if stream.stage is None:
+            stream.stage = Stage(position, [np.zeros((self.block, size), np.uint8) for size in self.layout.section_bytes])
+        else:  # The same memory again: it is written, and what it holds beyond the new records is not read.
+            stream.stage.start, stream.stage.written = position, 0
 
     def write_stage(self, stream: Stream) -> None:
         """Brings what is staged to the file; it stays staged."""
