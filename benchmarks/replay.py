@@ -125,10 +125,21 @@ def run_case(kind: str, filled: int, options: argparse.Namespace, limit: int) ->
 
 
 COLUMNS = (
-    ("kind", 19), ("records", 9), ("data_mib", 9), ("memory_limit_mib", 17), ("filling_per_s", 14), ("inserts_per_s", 14), ("batches_per_s", 14),
-    ("batches_per_s_mean", 19), ("new_batches_per_s", 18), ("write_back_ms", 14), ("write_back_after_save_ms", 25), ("save_s", 7),
-    ("own_mib", 8), ("mapped_mib", 11),
-)  # fmt: skip
+    ("kind", 19),
+    ("records", 9),
+    ("data_mib", 9),
+    ("memory_limit_mib", 17),
+    ("filling_per_s", 14),
+    ("inserts_per_s", 14),
+    ("batches_per_s", 14),
+    ("batches_per_s_mean", 19),
+    ("new_batches_per_s", 18),
+    ("write_back_ms", 14),
+    ("write_back_after_save_ms", 25),
+    ("save_s", 7),
+    ("own_mib", 8),
+    ("mapped_mib", 11),
+)
 
 
 def main() -> int:

@@ -206,7 +206,7 @@ class ReplayMachine(RuleBasedStateMachine):
                     self.train(seed + number, 3)
         which = min(which, len(self.saves) - 1)
         self.saves = self.saves[: len(self.saves) - which]
-        name, description, naive = self.saves[-1]
+        _, description, naive = self.saves[-1]
         directory = self.replay.directory
         with suppress(Killed), death(at):
             self.die(during, seed, description, continue_streams)

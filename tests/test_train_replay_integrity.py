@@ -165,8 +165,17 @@ def test_files_of_states_that_are_not_kept_go(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "description",
-    [None, 3, [], {}, {"format": 1, "file": "x"}, {"format": 1, "file": "../x", "crc32": 0}, {"format": 2, "file": "x", "crc32": 0}, {"format": 1, "file": "x", "crc32": "y"}],
-)  # fmt: skip
+    [
+        None,
+        3,
+        [],
+        {},
+        {"format": 1, "file": "x"},
+        {"format": 1, "file": "../x", "crc32": 0},
+        {"format": 2, "file": "x", "crc32": 0},
+        {"format": 1, "file": "x", "crc32": "y"},
+    ],
+)
 def test_what_is_no_description_is_refused(tmp_path: Path, description: object) -> None:
     with pytest.raises(ValueError, match="description"):
         Replay.restore(tmp_path, description, CAPACITY, LENGTH)  # type: ignore[arg-type]

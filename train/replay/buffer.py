@@ -27,7 +27,7 @@ BLOCK_RECORDS = 64
 
 
 class Replay:
-    """Sequences of T+1 consecutive records, found by their start positions. Implements [REP-1] to [REP-28]; every method takes `lock`.
+    """Sequences of T+1 consecutive records, found by their start positions. Implements [REP-1] to [REP-34]; every method takes `lock`.
 
     Args:
       capacity: how many start positions are kept.
@@ -274,7 +274,7 @@ class Replay:
                 self.items.append((number, start))
 
     def save(self, name: str) -> dict[str, Any]:
-        """Makes the content of this moment restorable, also after `kill -9`; see train/replay/recovery.py.
+        """Makes the content of this moment restorable, also after `kill -9`. Implements [REP-29], [REP-30].
 
         Returns:
           A description in plain JSON types, for `restore`. It holds until `keep` is called without the name.
@@ -301,7 +301,7 @@ class Replay:
         continue_streams: bool = False,
         **settings: Any,
     ) -> "Replay":
-        """The buffer as it was when `save` returned the description.
+        """The buffer as it was when `save` returned the description. Implements [REP-29] to [REP-31].
 
         Everything that was added or written back later is undone, saves made later are given up. Damaged or missing chunks are left out:
         `warnings` of the result names each of them and what went with it.

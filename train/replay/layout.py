@@ -115,8 +115,9 @@ class Layout:
         """
         if stoch.dtype.kind not in "iu":
             raise ValueError(f"{name}: expected class indices of an integer type, got {stoch.dtype}")
-        if stoch.size and (stoch.min() < 0 or stoch.max() >= self.classes):
-            raise ValueError(f"{name}: expected class indices in [0, {self.classes}), got {stoch.min()} to {stoch.max()}")
+        low, high = (stoch.min(), stoch.max()) if stoch.size else (0, 0)
+        if low < 0 or high >= self.classes:
+            raise ValueError(f"{name}: expected class indices in [0, {self.classes}), got {low} to {high}")
 
     def pack_latents(self, deter: NDArray[Any], stoch: NDArray[Any]) -> NDArray[np.uint8]:
         """The bytes [N, ...] of latents: deter [N, D], stoch [N, S] class indices in range."""
