@@ -247,7 +247,7 @@ def reserve(fd: int, size: int) -> None:
 
 def write_all(fd: int, data: bytes | NDArray[np.uint8], offset: int) -> None:
     """Writes all of it, in as many calls as it takes."""
-    left = memoryview(data) if isinstance(data, bytes) else np.ascontiguousarray(data).data.cast("B")
+    left = memoryview(data) if isinstance(data, bytes) else np.ascontiguousarray(data).reshape(-1).data
     while left:
         written = os.pwrite(fd, left, offset)
         left, offset = left[written:], offset + written

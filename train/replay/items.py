@@ -1,6 +1,7 @@
 """Which sequences exist: the start positions in the order of their creation, and the online queue."""
 
 import collections
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,5 +80,10 @@ def require_representable(number: int, position: int) -> None:
     """Raises:
     ValueError: more streams or records than the index can tell apart; eight million starts or a trillion steps of one worker.
     """
-    if number >= _STREAMS or position >= _POSITIONS:
+    if not are_representable(number, position):
         raise ValueError(f"stream {number}, position {position}: the index holds {_STREAMS} streams of {_POSITIONS} records")
+
+
+def are_representable(number: int, positions: Any) -> bool:
+    """Whether the index can tell these apart; positions: a number or an array."""
+    return number < _STREAMS and bool(np.all(positions < _POSITIONS))

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from train.replay.chunks import Chunk, ChunkStore, Shape
-from train.replay.items import decode, encode
+from train.replay.items import are_representable, decode, encode
 from train.replay.journal import entries, journal_epochs, journal_path, old_latents
 from train.replay.layout import Layout
 from train.replay.saves import read_saved, saved_epochs, saved_path
@@ -104,6 +104,16 @@ def _matching_storage(replay: Replay, arrays: Arrays, facts: Mapping[str, Any]) 
         raise ValueError(f"the saved replay in {replay.directory} contradicts itself: chunks of {records} records, blocks of {block}")
     if len(chunks) and (sums.shape[1] != len(layout.section_bytes) - 1 or block_sums.shape[1] != records // block):
         raise ValueError(f"the saved replay in {replay.directory} contradicts itself: {sums.shape[1]} and {block_sums.shape[1]} checksums")
+    streams, places = arrays["streams"], chunks[:, 1:3]
+    distinct = (streams[:, 0], chunks[:, 0], encode(places))
+    if (
+        not all(len(np.unique(values)) == len(values) for values in distinct)
+        or np.any(streams[:, 1] > streams[:, 2])
+        or np.any(streams[:, 0] >= facts["next_stream"])
+        or not are_representable(facts["next_stream"], streams[:, 2])
+        or not are_representable(facts["next_stream"], records * chunks[:, 2].astype(object))
+    ):
+        raise ValueError(f"the saved replay in {replay.directory} contradicts itself: its streams or chunks are impossible")
     store = ChunkStore(replay.directory, Shape(layout, records), replay.memory_limit)
     replay.storage = Storage(store, block, replay.history)
     return replay.storage
@@ -189,8 +199,8 @@ def _unbroken(chunks: Mapping[int, Chunk], first: int, count: int, records: int)
       ValueError: a chunk has fewer records than the stream says.
     """
     ranges: list[tuple[int, int]] = []
-    for index in range(first // records, -(-count // records)):
-        if index not in chunks:
+    for index in sorted(chunks):
+        if (index + 1) * records <= first or index * records >= count:
             continue
         begin, end = max(first, index * records), min(count, (index + 1) * records)
         if chunks[index].count < end - index * records:

@@ -156,7 +156,7 @@ def read_kept(path: Path) -> Saved:
         with safe_open(path, framework="numpy") as file:
             facts = json.loads((file.metadata() or {})["replay"])
             return Saved(str(facts["name"]), frozenset(file.get_tensor("chunks")[:, 0].tolist()))
-    except (OSError, SafetensorError, KeyError, TypeError, IndexError, ValueError) as error:
+    except (OSError, SafetensorError, KeyError, TypeError, IndexError, ValueError, RecursionError) as error:
         raise ValueError(f"the replay file {path} is damaged: {error}") from error
 
 
@@ -182,7 +182,7 @@ def read_saved(directory: Path, description: Any) -> tuple[dict[str, NDArray[Any
         with safe_open(path, framework="numpy") as file:
             facts = json.loads((file.metadata() or {})["replay"])
         _require_arrays(arrays, facts)
-    except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
+    except (OSError, SafetensorError, KeyError, TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"the replay file {path} is damaged: {error}") from error
     return arrays, facts
 
