@@ -184,7 +184,7 @@ class ReplayMachine(RuleBasedStateMachine):
         self.naive.load_state_dict(self.naive.state_dict())
 
     @rule(
-        lives=st.lists(st.sampled_from(["train", "save"]), max_size=6),
+        lives=st.lists(st.sampled_from(["train", "save", "add"]), max_size=6),
         which=st.integers(0, 2),
         continue_streams=st.booleans(),
         during=st.sampled_from(["nothing", "add", "write_back", "save", "keep", "restore"]),
@@ -201,8 +201,8 @@ class ReplayMachine(RuleBasedStateMachine):
             if what == "save":
                 self.save(3)
             else:
-                self.add_batch(seed + number, 1)
-                if len(self.naive):
+                self.add_batch(seed + number, 3 if what == "add" else 1)
+                if what == "train" and len(self.naive):
                     self.train(seed + number, 3)
         which = min(which, len(self.saves) - 1)
         self.saves = self.saves[: len(self.saves) - which]

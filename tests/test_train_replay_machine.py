@@ -11,14 +11,14 @@ def test_the_buffer_is_the_naive_one() -> None:
 
 @pytest.mark.slow
 def test_the_buffer_is_the_naive_one_in_many_histories() -> None:
-    run_machine(examples=3000, steps=80)
+    run_machine(examples=1000, steps=80)
 
 
 @pytest.mark.parametrize("mistake", MISTAKES, ids=lambda mistake: mistake.explanation.replace(" ", "_"))
 def test_the_mistake_is_caught(mistake: Mistake, monkeypatch: pytest.MonkeyPatch) -> None:
     mistake.plant(monkeypatch)
     try:
-        run_machine(examples=300, shrink=False)
+        run_machine(examples=1000, shrink=False)
     except Exception:
         return
     pytest.fail(f"the machine did not notice: {mistake.explanation}")
