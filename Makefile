@@ -27,7 +27,7 @@ lint: $(VENV)/.installed
 	$(RUN)/ruff check --fix .
 	$(RUN)/mypy
 
-# constraints.txt pins PyTorch first: a plain `torch` would bring gigabytes of CUDA libraries.
+# PyTorch first and by its version in constraints.txt: what else needs it then takes the build that is there.
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(RUN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt torch

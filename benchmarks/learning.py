@@ -2,8 +2,8 @@
 
     python -m benchmarks.learning --out FOLDER/NAME -- OPTIONS OF TRAIN
 
-Everything after `--` goes to `train` as it is. Writes NAME.json (command, machine, and the points of every curve) and NAME.png (evaluation
-returns, and a panel for each of `--metrics`). A run that is already complete in `--logdir` is not repeated.
+Everything after `--` goes to `train` as it is. Writes NAME.json (command, machine, and the points of every curve) and NAME.png (returns,
+and a panel for each of `--metrics`). A run that has come to its end in `--logdir` is not repeated.
 """
 
 import argparse
@@ -11,7 +11,6 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -19,24 +18,29 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter
+from matplotlib.ticker import EngFormatter, FormatStrFormatter
 
 from benchmarks.machine import describe
 from train.curve import BLUE, GRAY, ORANGE
 from train.logger import read_metrics
 
 COLORS = {"jax": BLUE, "torch": ORANGE}
-RETURN = "evaluation/return"
+EVALUATION, EPISODES = "evaluation/return", "episode/return"
+BINS = 50  # points of a curve
 
 
 def train(backend: str, seed: int, logdir: Path, arguments: list[str]) -> None:
-    """One run in a process of its own, on the cores of this thread.
+    """One run in a process of its own, on the cores of this thread, unless it is there already.
 
     Raises:
       RuntimeError: the run failed.
     """
     command = [sys.executable, "-m", "train", "--backend", backend, "--seed", str(seed), "--logdir", str(logdir), *arguments]
+    made = logdir / "made.json"
+    if (logdir / "curve.png").exists() and made.exists() and json.loads(made.read_text(encoding="utf-8"))["arguments"] == arguments:
+        return
     logdir.mkdir(parents=True, exist_ok=True)
+    made.write_text(json.dumps({"arguments": arguments, "machine": describe()}), encoding="utf-8")
     with open(logdir / "output.log", "w", encoding="utf-8") as log:
         result = subprocess.run(command, stdout=log, stderr=log, check=False)
     last = (logdir / "output.log").read_text(encoding="utf-8").strip().splitlines()[-1:]
@@ -46,64 +50,81 @@ def train(backend: str, seed: int, logdir: Path, arguments: list[str]) -> None:
 
 
 def points(logdir: Path, metrics: list[str]) -> dict[str, Any]:
-    """The curves of one run: name -> list of [step, minutes of training, value]; "random": what a random policy gets."""
+    """The curves of one run: name -> list of [step, minutes of training, value]; "random": what a random policy gets.
+
+    Evaluations are all there; episodes and metrics are means over equal stretches of the run.
+    """
     lines = read_metrics(logdir / "metrics.jsonl")
-    curves = {
-        name: [[line["step"], round(line["seconds"] / 60, 2), float(f"{line[name]:.4g}")] for line in lines if name in line]
-        for name in (RETURN, *metrics)
+    curves = {EVALUATION: column(lines, EVALUATION), **{name: means(column(lines, name)) for name in (EPISODES, *metrics)}}
+    rounded = {
+        name: [[int(step), round(minutes, 2), float(f"{value:.4g}")] for step, minutes, value in curve] for name, curve in curves.items()
     }
-    return curves | {"random": next((line["random/return"] for line in lines if "random/return" in line), None)}
+    machine = json.loads((logdir / "made.json").read_text(encoding="utf-8"))["machine"]
+    return rounded | {"random": next((line["random/return"] for line in lines if "random/return" in line), None), "machine": machine}
 
 
-def smooth(curve: list[list[float]], bins: int = 60) -> np.ndarray:
-    """Means over equal parts of a long curve, for the eye."""
-    values = np.array(curve)
-    return values if len(values) <= bins else np.array([part.mean(0) for part in np.array_split(values, bins)])
+def column(lines: list[dict[str, float]], name: str) -> np.ndarray:
+    return np.array([(line["step"], line["seconds"] / 60, line[name]) for line in lines if name in line]).reshape(-1, 3)
+
+
+def means(curve: np.ndarray) -> np.ndarray:
+    """Means over BINS equal stretches of steps; a stretch without points is left out."""
+    if not len(curve):
+        return curve
+    stretch = np.minimum((curve[:, 0] / curve[-1, 0] * BINS).astype(int), BINS - 1)
+    return np.array([curve[stretch == index].mean(0) for index in np.unique(stretch)])
 
 
 def draw(path: Path, title: str, runs: list[dict[str, Any]], metrics: list[str]) -> None:
-    """Evaluations of every run (thin) with their mean per backend (thick), and the other metrics of every run."""
-    panels = [RETURN, *metrics]
-    figure = Figure(
-        figsize=(8 if len(panels) == 1 else 4.2 * min(len(panels), 3), 4.2 * -(-len(panels) // 3)), dpi=130, layout="constrained"
-    )
+    """Returns of training episodes of every run (thin) and their mean per backend (thick), evaluations (dots), and the other metrics.
+
+    A run that is shorter than its first episode has no returns to draw.
+    """
+    panels = [name for name in (EPISODES, *metrics) if any(run[name] for run in runs)]
+    columns, rows = min(len(panels), 3), -(-len(panels) // 3)
+    figure = Figure(figsize=(8 if len(panels) == 1 else 4.2 * columns, 4.2 * rows), dpi=130, layout="constrained")
     figure.suptitle(title, x=0.01, ha="left", fontsize=11)
-    for panel, axes in zip(panels, figure.subplots(-(-len(panels) // 3), min(len(panels), 3), squeeze=False).flat, strict=False):
+    grid = figure.subplots(rows, columns, squeeze=False).flat
+    for axes in grid[len(panels) :]:
+        axes.set_visible(False)
+    for panel, axes in zip(panels, grid, strict=False):
         for run in runs:
             if run[panel]:
-                steps, _, values = smooth(run[panel]).T
-                axes.plot(steps, values, color=COLORS[run["backend"]], alpha=0.35 if panel == RETURN else 0.8, linewidth=1)
-        if panel == RETURN:
-            draw_means(axes, runs)
-        axes.set_ylabel("return of evaluation episodes" if panel == RETURN else panel.removeprefix("train/"))
+                steps, _, values = np.array(run[panel]).T
+                label = None if panel == EPISODES else f"{run['backend']}, seed {run['seed']}"
+                axes.plot(steps, values, color=COLORS[run["backend"]], alpha=0.35 if panel == EPISODES else 0.8, linewidth=1, label=label)
+        if panel == EPISODES:
+            draw_returns(axes, runs)
+        if panel == panels[0]:
+            figure.legend(*axes.get_legend_handles_labels(), frameon=False, fontsize=9, loc="outside lower center", ncols=3)
+        axes.set_ylabel("return" if panel == EPISODES else panel.removeprefix("train/"))
         axes.set_xlabel("environment steps")
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(axis="y", alpha=0.25)
         if panel.startswith("train/loss/") and all(value > 0 for run in runs for _, _, value in run[panel]):
             axes.set_yscale("log")
+            for ticks in (axes.yaxis.set_major_formatter, axes.yaxis.set_minor_formatter):
+                ticks(FormatStrFormatter("%g"))
     figure.savefig(path)
 
 
-def draw_means(axes: Axes, runs: list[dict[str, Any]]) -> None:
-    for backend, curves in by_backend(runs):
-        steps = [step for step, _, _ in curves[0]]
-        means = np.mean([[value for _, _, value in curve] for curve in curves], axis=0)
-        label = f"{backend}, mean of {len(curves)} seeds" if len(curves) > 1 else backend
-        axes.plot(steps, means, color=COLORS[backend], linewidth=2.5, marker="o", markersize=4, label=label)
+def draw_returns(axes: Axes, runs: list[dict[str, Any]]) -> None:
+    for backend in COLORS:
+        group = [run for run in runs if run["backend"] == backend]
+        training = [np.array(run[EPISODES]) for run in group if run[EPISODES]]
+        if not training:
+            continue
+        grid = np.linspace(max(curve[0, 0] for curve in training), min(curve[-1, 0] for curve in training), 2 * BINS)
+        mean = np.mean([np.interp(grid, curve[:, 0], curve[:, 2]) for curve in training], axis=0)
+        seeds = f", mean of {len(group)} seeds" if len(group) > 1 else ""
+        axes.plot(grid, mean, color=COLORS[backend], linewidth=2.5, label=f"{backend}, training episodes{seeds}")
+        steps, _, values = np.array([point for run in group for point in run[EVALUATION]]).reshape(-1, 3).T
+        axes.plot(steps, values, "o", color=COLORS[backend], markersize=5, markeredgecolor="white", label=f"{backend}, evaluations")
     random = [run["random"] for run in runs if run["random"] is not None]
     if random:
         axes.axhline(np.mean(random), color=GRAY, linestyle="--", linewidth=1.2, label=f"random policy ({np.mean(random):.4g})")
-    axes.legend(frameon=False, fontsize=9)
     axes.set_xlim(left=0)
-
-
-def by_backend(runs: list[dict[str, Any]]) -> Iterator[tuple[str, list[list[list[float]]]]]:
-    """Each backend with the evaluations of its runs."""
-    for backend in COLORS:
-        curves = [run[RETURN] for run in runs if run["backend"] == backend]
-        if curves:
-            yield backend, curves
 
 
 def main() -> int:
@@ -119,6 +140,8 @@ def main() -> int:
     options, arguments = parser.parse_args(sys.argv[1:split]), sys.argv[split + 1 :]
 
     cores = sorted(os.sched_getaffinity(0))
+    if not 1 <= options.jobs <= len(cores):
+        parser.error(f"--jobs is {options.jobs}; expected 1 to {len(cores)}, the number of cores")
     shares = [set(cores[job :: options.jobs]) for job in range(options.jobs)]
     free = list(shares)
     cases = [
@@ -131,12 +154,12 @@ def main() -> int:
     runs = [{"backend": backend, "seed": seed, **points(logdir, options.metrics)} for backend, seed, logdir in cases]
     options.out.parent.mkdir(parents=True, exist_ok=True)
     command = "python -m benchmarks.learning " + " ".join(sys.argv[1:])
-    report = {"command": command, "cores_per_run": len(shares[0]), "machine": describe(), "runs": runs}
+    report = {"command": command, "cores_per_run": len(shares[0]), "runs": runs}
     options.out.with_suffix(".json").write_text(json.dumps(report) + "\n", encoding="utf-8")
     draw(options.out.with_suffix(".png"), options.title, runs, options.metrics)
     for run in runs:
-        step, minutes, value = run[RETURN][-1]
-        print(f"{run['backend']:6} seed {run['seed']}: {value} after {step:,} steps and {minutes} minutes; random {run['random']}")
+        for step, minutes, value in run[EVALUATION][-1:]:
+            print(f"{run['backend']:6} seed {run['seed']}: {value} after {step:,} steps and {minutes} minutes; random {run['random']}")
     return 0
 
 

@@ -67,7 +67,7 @@ def measure(
         "step_s": round(statistics.median(times), 4),
         "steps": steps,
         "peak_memory_gib": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 2),
-        "device_memory_gib": device_memory(backend),
+        "device_memory_gib": None if learner.device == "cpu" else device_memory(backend),
     }
 
 

@@ -162,7 +162,11 @@ class Run:
         def decorate(body: Callable[..., None]) -> None:
             wrapped = hypothesis.given(**strategies)(body)
             wrapped = hypothesis.settings(
-                max_examples=self.examples, deadline=None, database=None, suppress_health_check=list(hypothesis.HealthCheck)
+                max_examples=self.examples,
+                deadline=None,
+                database=None,
+                suppress_health_check=list(hypothesis.HealthCheck),
+                report_multiple_bugs=False,  # several deviations would come as a group, which is no Deviation
             )(wrapped)
             hypothesis.seed(self.seed)(wrapped)()
 

@@ -8,12 +8,14 @@ import contextlib
 import dataclasses
 import importlib
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
 from conformance.adapters.numpy_adapter import NumpyAdapter
+from conformance.check import Check
+from conformance.execute import Result, run_check
 from reference_numpy import behavior, distributions, layers, optimizer, returns, rssm, transforms, world_model
 from reference_numpy.stop_gradient import stop_gradient
 
@@ -76,6 +78,26 @@ class MutantAdapter:
                 return getattr(self._reference, name)(*arguments)
 
         return call
+
+
+def caught_by(mutant: Mutant, checks: Iterable[Check], examples: int = 5) -> dict[str, list[str]]:
+    """The names of the checks that find a deviation ("fail") and of those in which the mutant raises ("error").
+
+    A check says something about a mutant only if the reference passes it: see `sound`.
+    """
+    found: dict[str, list[str]] = {"fail": [], "error": []}
+    for check in checks:
+        status = run_check(check, MutantAdapter(mutant), "float64", "paper", examples=examples).status
+        if status in found:
+            found[status].append(check.name)
+    return found
+
+
+def sound(checks: Iterable[Check], examples: int = 5) -> tuple[list[Check], list[Result]]:
+    """The checks that the reference without a mistake passes, and the results of those that it does not: they would catch anything."""
+    results = [run_check(check, NumpyAdapter(), "float64", "paper", examples=examples) for check in checks]
+    broken = [result for result in results if result.status in ("fail", "error")]
+    return [result.check for result in results if result.status == "pass"], broken
 
 
 # --- Returns ---------------------------------------------------------------------------------------------------------------------------

@@ -6,11 +6,13 @@ reward and critic outputs too, which start at zero in training), episodes begin,
 
 import dataclasses
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from conformance.check import round_to
+from reference_numpy import agent
 from spec import Config, Discrete, Image, Spaces, Vector, load_config, parameter_table
 
 OBSERVATIONS: dict[str, dict[str, Vector | Discrete | Image]] = {
@@ -190,3 +192,23 @@ def nudged(problem: Problem, distance: float) -> Problem:
     shift = {"posterior": distance, "prior": distance, "action": distance * np.array(is_uniform)}
     noise = {name: value + shift[name] for name, value in problem.noise.items()}
     return dataclasses.replace(problem, noise=noise)
+
+
+def with_sampling_margin(
+    draw: Callable[[int], Problem], margin: float, accept: Callable[[Problem], bool] = lambda problem: True, attempts: int = 1000
+) -> Problem:
+    """The first of draw(0), draw(1), ... that is accepted, and in which honest rounding moves no sample into another class.
+
+    It is so when moving every uniform number by the margin, to both sides, changes the total of the reference in no bit.
+
+    Raises:
+      RuntimeError: none of that many attempts gives such a problem.
+    """
+    for attempt in range(attempts):
+        problem = draw(attempt)
+        if not accept(problem):
+            continue
+        below, above = (agent.losses(*nudged(problem, distance).loss_arguments)[0] for distance in (-margin, margin))
+        if below == above and math.isfinite(below):
+            return problem
+    raise RuntimeError(f"none of {attempts} problems keeps every sample {margin:g} away from the next class")

@@ -12,6 +12,7 @@ A part stands between a marker line and an end line, and is never edited by hand
 
 import ast
 import json
+import math
 import re
 import sys
 from collections.abc import Callable
@@ -88,8 +89,9 @@ def conformance_summary() -> str:
         statuses = [entry["status"] for entry in report["checks"].values()]
         counts = [str(statuses.count(status)) for status in ("pass", "fail", "error", "not offered")]
         numbers = sum(entry["compared"] for entry in report["checks"].values())
-        name, worst = max(report["requirements"].items(), key=lambda item: item[1]["share"] or 0)
-        rows.append([*key, *counts, f"{numbers:,}", f"{worst['share']:.0%} ({name})"])
+        name, worst = max(report["requirements"].items(), key=lambda item: math.inf if item[1]["share"] is None else item[1]["share"])
+        share = "no number" if worst["share"] is None else f"{worst['share']:.0%}"
+        rows.append([*key, *counts, f"{numbers:,}", f"{share} ({name})"])
     return markdown_table(
         ["backend", "dtype", "profile", "pass", "fail", "error", "not offered", "numbers compared", "worst, of allowed"], rows
     )
@@ -106,7 +108,8 @@ def conformance_chapters() -> str:
         if not offered:
             return "not offered"
         passed = sum(entry["status"] == "pass" for entry in offered)
-        return f"{passed} of {len(offered)}, {max(entry['deviation'] or 0 for entry in offered):.0e}"
+        worst = max(math.inf if entry["deviation"] is None else entry["deviation"] for entry in offered)
+        return f"{passed} of {len(offered)}, {worst:.0e}"
 
     rows = [[prefix, *(cell(report, prefix) for report in runs.values())] for prefix in prefixes]
     return markdown_table(["requirements", *(f"{backend}, {profile}" for backend, _, profile in runs)], rows)
@@ -140,11 +143,9 @@ def learning_table() -> str:
         for run in json.loads(path.read_text(encoding="utf-8"))["runs"]:
             if run["evaluation/return"]:
                 step, minutes, value = run["evaluation/return"][-1]
-                times = f"{value / run['random']:.1f}" if run["random"] else ""
+                random, times = (f"{run['random']:.4g}", f"{value / run['random']:.1f}") if run["random"] else ("", "")
                 name = path.stem.removeprefix("learning-")
-                rows.append(
-                    [name, run["backend"], str(run["seed"]), f"{step:,}", f"{minutes:.1f}", f"{value:g}", f"{run['random']:.4g}", times]
-                )
+                rows.append([name, run["backend"], str(run["seed"]), f"{step:,}", f"{minutes:.1f}", f"{value:g}", random, times])
     return markdown_table(["curve", "backend", "seed", "steps", "minutes", "return", "random policy", "ratio"], rows)
 
 

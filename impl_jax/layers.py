@@ -140,7 +140,19 @@ def rms_norm_over(x: jax.Array, scale: jax.Array, epsilon: float, axes: tuple[in
     count = math.prod(x.shape[axis] for axis in axes)
     # The factor goes in before the square, so that the sum of many large squares cannot overflow where their mean does not.
     mean_square = jnp.sum(jnp.square(wide * count**-0.5), axis=axes, keepdims=True)
-    return (wide * lax.rsqrt(mean_square + epsilon) * scale.astype(wide.dtype)).astype(x.dtype)
+    return (wide * lax.rsqrt(mean_square + epsilon) * _rounded(scale, x.dtype)).astype(x.dtype)
+
+
+def _rounded(scale: jax.Array, dtype: jnp.dtype) -> jax.Array:
+    """A scale in float32 or better, with the digits that it has in `dtype`. [LAY-1]
+
+    Its gradient is not rounded [CON-23]. A conversion to `dtype` and back would round it, and compilers may leave such a pair out.
+    """
+    wide = scale.astype(jnp.promote_types(dtype, jnp.float32))
+    if wide.dtype == dtype:
+        return wide
+    digits = jnp.finfo(dtype)
+    return wide + lax.stop_gradient(lax.reduce_precision(wide, digits.nexp, digits.nmant) - wide)
 
 
 def silu(x: jax.Array) -> jax.Array:
@@ -161,7 +173,7 @@ def _activate_bwd(epsilon: float, saved: tuple[jax.Array, jax.Array], g: jax.Arr
     x, scale = saved
 
     def rows(x: jax.Array, g: jax.Array) -> tuple[jax.Array, jax.Array]:
-        wide, scale_, count = real(x), scale.astype(real(x).dtype), x.shape[-1]
+        wide, scale_, count = real(x), _rounded(scale, x.dtype), x.shape[-1]
         inverse = lax.rsqrt(jnp.sum(jnp.square(wide * count**-0.5), -1, keepdims=True) + epsilon)
         unit = wide * inverse
         # As in the forward pass, what SiLU reads is rounded to the compute dtype.

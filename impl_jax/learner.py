@@ -1,6 +1,9 @@
 """The backend behind the interface of training: one agent and its optimizer on one device."""
 
+import dataclasses
+import functools
 import math
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -18,7 +21,7 @@ Arrays = Mapping[str, np.ndarray]
 class Learner:
     """An agent on one device.
 
-    seed: of the initial parameters. device: "cpu", "gpu" or "cuda"; None takes the best that JAX finds.
+    seed: of the initial parameters. device: see `select_device`.
 
     Raises:
       ValueError: an unknown device, or one that this installation of JAX does not have.
@@ -28,8 +31,8 @@ class Learner:
         if config.compute_dtype == "float64":
             jax.config.update("jax_enable_x64", True)
         self.spaces, self.config = spaces, config
-        self._device = _find_device(device)
-        self.device = self._device.platform
+        self._device = select_device(device)
+        self.device = ":".join([self._device.platform, *(device or "").split(":")[1:]])
         with jax.default_device(self._device):
             state = jax.jit(_initial_state, static_argnums=1)(np.uint32(seed), _Static(spaces, config))
         self._state = jax.device_put(state, self._device)
@@ -66,7 +69,7 @@ class Learner:
             raise ValueError(f"the train batch lacks {', '.join(missing)}; it has {', '.join(sorted(batch))}")
         inputs = jax.device_put({key: batch[key] for key in self._batch_keys}, self._device)
         self._state, metrics, latents = self._train(self._state, inputs, np.uint32(seed))
-        return metrics, latents
+        return {name: _Element(metrics.values, index) for index, name in enumerate(metrics.names)}, latents
 
     def state_dict(self) -> dict[str, np.ndarray]:
         """The training state under its canonical names. [AGT-8], [AGT-9]"""
@@ -108,11 +111,34 @@ class Learner:
         noise = _noise(seed, uniforms, (N, H), self.spaces, self.config)
         state, aux = agent.train_step(state, batch, noise, self.spaces, self.config)
         metrics = {f"loss/{name}": mean for name, mean in aux["losses"].items()} | aux["metrics"]
-        return state, metrics, self._stored(aux)
+        values = jnp.stack([value.astype(exact_dtype(self.config)) for value in metrics.values()])
+        return state, _Metrics(tuple(metrics), values), self._stored(aux)
 
     def _stored(self, states: Any) -> dict[str, jax.Array]:
         """Latents as the replay buffer keeps them."""
         return {"deter": states["deter"].astype(jnp.float32), "stoch": jnp.argmax(states["stoch"], -1).astype(jnp.int32)}
+
+
+@functools.partial(jax.tree_util.register_dataclass, data_fields=["values"], meta_fields=["names"])
+@dataclasses.dataclass(frozen=True)
+class _Metrics:
+    """Numbers in one array, which comes to the host in one copy."""
+
+    names: tuple[str, ...]
+    values: jax.Array
+
+
+class _Element:
+    """One number of an array that may still be computing."""
+
+    def __init__(self, array: jax.Array, index: int) -> None:
+        self._array, self._index = array, index
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        return np.array(np.asarray(self._array)[self._index], dtype)
+
+    def __float__(self) -> float:
+        return float(np.asarray(self._array)[self._index])
 
 
 class _Static:
@@ -122,13 +148,25 @@ class _Static:
         self.spaces, self.config = spaces, config
 
 
-def _find_device(name: str | None) -> jax.Device:
-    if name not in (None, "cpu", "gpu", "cuda"):
-        raise ValueError(f"unknown device {name!r}; known: cpu, gpu, cuda")
+def select_device(name: str | None) -> jax.Device:
+    """The device of that name: "cpu", "gpu" or "cuda", "cuda:1", ...; None takes the best that JAX finds.
+
+    Raises:
+      ValueError: an unknown device, or one that this installation of JAX does not have.
+    """
+    if name is None:
+        return jax.devices()[0]
+    match = re.fullmatch(r"(cpu)|(gpu|cuda)(?::([0-9]+))?", name)
+    if match is None:
+        raise ValueError(f"unknown device {name!r}; expected cpu, gpu, cuda, gpu:<number> or cuda:<number>")
     try:
-        return jax.devices(name)[0]
+        devices = jax.devices(match[1] or match[2])
     except RuntimeError as error:
         raise ValueError(f"JAX finds no device {name!r} here, only {jax.default_backend()!r}; install jax[cuda12] for a GPU") from error
+    index = int(match[3] or 0)
+    if index >= len(devices):
+        raise ValueError(f"JAX finds no device {name!r} here: there are {len(devices)} GPUs, counted from 0")
+    return devices[index]
 
 
 def _initial_state(seed: jax.Array, static: _Static) -> dict[str, Any]:

@@ -65,11 +65,16 @@ def _correction(beta: float, step: ArrayLike, dtype: jnp.dtype) -> jax.Array:
     return -jnp.expm1((jnp.asarray(step).astype(dtype) + 1.0) * math.log(beta))
 
 
+def _check_betas(beta1: float, beta2: float) -> None:
+    """[OPT-14]"""
+    for name, beta in (("beta1", beta1), ("beta2", beta2)):
+        require(0 <= beta < 1, name, "at least 0 and below 1: at 1 the bias correction would be 0/0", beta)
+
+
 def _laprop(
     gradient: jax.Array, second_moment: jax.Array, momentum: jax.Array, step: ArrayLike, beta1: float, beta2: float, epsilon: float
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    for name, beta in (("beta1", beta1), ("beta2", beta2)):
-        require(beta < 1, name, "below 1: the bias correction would be 0/0", beta)
+    _check_betas(beta1, beta2)
     gradient = jnp.where(jnp.abs(gradient) < _DEAD_ZONE, 0.0, gradient)
     second_moment = beta2 * second_moment + (1.0 - beta2) * jnp.square(gradient)
     root = jnp.sqrt(second_moment / _correction(beta2, step, gradient.dtype)) + epsilon
@@ -165,7 +170,12 @@ class LaPropState(NamedTuple):
 
 
 def scale_by_laprop(beta1: float = 0.9, beta2: float = 0.99, epsilon: float = 1e-20) -> optax.GradientTransformation:
-    """LaProp: normalized by their own recent size first, averaged over time second. [OPT-8] to [OPT-12]"""
+    """LaProp: normalized by their own recent size first, averaged over time second. [OPT-8] to [OPT-12]
+
+    Raises:
+      ValueError: a beta outside [0, 1).
+    """
+    _check_betas(beta1, beta2)
 
     def init(params: optax.Params) -> LaPropState:
         def zeros() -> optax.Updates:

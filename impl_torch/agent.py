@@ -50,9 +50,6 @@ def initial_state(params: Mapping[str, Tensor]) -> dict[str, Any]:
     """A fresh training state. [AGT-7] [AGT-8] [OPT-13]"""
     zero = next(iter(params.values())).new_zeros(())
 
-    def zeros() -> dict[str, Tensor]:
-        return {name: torch.zeros_like(x) for name, x in params.items()}
-
     return {
         "params": dict(params),
         "slow_critic": {name: x.detach().clone() for name, x in params.items() if name.startswith("critic/")},

@@ -133,7 +133,8 @@ def rms_norm(x: Tensor, scale: Tensor, epsilon: float) -> Tensor:
     """x / sqrt(mean(x^2) + epsilon) * scale over the last axis: [..., n] and [n] -> [..., n]. [LAY-1] [LAY-4] [LAY-15]"""
     expect_shape("scale", scale, x.shape[-1:])
     normal, _ = normalize(x, epsilon)
-    return (normal * scale.to(x.dtype)).to(x.dtype)
+    rounded = scale + (scale.to(x.dtype) - scale).detach()  # in this way its gradient is not rounded too [CON-23]
+    return (normal * rounded).to(x.dtype)
 
 
 def silu(x: Tensor) -> Tensor:
@@ -184,6 +185,24 @@ class _NormSilu(torch.autograd.Function):
         return by_x.to(x.dtype), by_scale.to(scale.dtype), None
 
 
+class _BiasGradient(torch.autograd.Function):
+    """y [..., out], to which the bias was added before; its gradient is summed here, in float32: libraries would round it. [CON-23]"""
+
+    @staticmethod
+    def forward(ctx: Any, y: Tensor, bias: Tensor) -> Tensor:
+        ctx.dtype = bias.dtype
+        return y.view_as(y)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:
+        return gradient, gradient.sum(tuple(range(gradient.ndim - 1)), dtype=torch.float32).to(ctx.dtype)
+
+
+def _inner_bias(bias: Tensor, dtype: torch.dtype) -> Tensor:
+    """The bias as a convolution adds it: without a gradient where `_BiasGradient` takes care of it."""
+    return bias.detach().to(dtype) if dtype in NARROW else bias.to(dtype)
+
+
 def _check_convolution(x: Tensor, kernel: Tensor, bias: Tensor) -> None:
     expect(x.ndim >= 3, "x", "shape [..., H, W, in]", list(x.shape))
     expect(kernel.ndim == 4 and tuple(kernel.shape[:2]) == (5, 5), "kernel", "shape [5, 5, in, out]", list(kernel.shape))
@@ -210,15 +229,18 @@ def convolution(x: Tensor, kernel: Tensor, bias: Tensor, stride: int) -> Tensor:
     planes = _to_planes(x)
     if stride == 2:
         planes = F.pad(planes, (1, 2, 1, 2))
-    y = F.conv2d(planes, kernel.to(x.dtype).permute(3, 2, 0, 1), bias.to(x.dtype), stride, padding=2 if stride == 1 else 0)
-    return _to_pixels(y, x)
+    inner = _inner_bias(bias, x.dtype)
+    y = _to_pixels(F.conv2d(planes, kernel.to(x.dtype).permute(3, 2, 0, 1), inner, stride, padding=2 if stride == 1 else 0), x)
+    return _BiasGradient.apply(y, bias) if x.dtype in NARROW else y
 
 
 def transposed_convolution(x: Tensor, kernel: Tensor, bias: Tensor) -> Tensor:
     """The adjoint of the stride-2 convolution: [..., H, W, in], [5, 5, in, out], [out] -> [..., 2H, 2W, out]. [LAY-1] [LAY-7] [LAY-15]"""
     _check_convolution(x, kernel, bias)
-    y = F.conv_transpose2d(_to_planes(x), kernel.to(x.dtype).permute(2, 3, 0, 1), bias.to(x.dtype), stride=2, padding=1)
-    return _to_pixels(y[:, :, :-1, :-1], x)  # PyTorch pads on both sides alike, so one row and one column come out too many
+    inner = _inner_bias(bias, x.dtype)
+    y = F.conv_transpose2d(_to_planes(x), kernel.to(x.dtype).permute(2, 3, 0, 1), inner, stride=2, padding=1)
+    y = _to_pixels(y[:, :, :-1, :-1], x)  # PyTorch pads on both sides alike, so one row and one column come out too many
+    return _BiasGradient.apply(y, bias) if x.dtype in NARROW else y
 
 
 def max_pool(x: Tensor) -> Tensor:

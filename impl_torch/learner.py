@@ -1,6 +1,7 @@
 """What training talks to: one agent and its optimizer on one device. Interface: train/backend.py."""
 
 import os
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -20,6 +21,7 @@ Arrays = Mapping[str, np.ndarray]
 # Up to this many recurrent units one thread is as fast as several on a quiet machine, and many times as fast on a busy one, where each of
 # the thousands of small operations of a step would wait for the slowest thread.
 SMALL = 256
+_THREADS = torch.get_num_threads()  # as the process came
 
 
 class Learner:
@@ -35,8 +37,9 @@ class Learner:
         self.spaces, self.config = spaces, config
         self._device = select_device(device)
         self.device = str(self._device)
-        if self._device.type == "cpu" and config.deter <= SMALL and "OMP_NUM_THREADS" not in os.environ:
-            torch.set_num_threads(1)
+        if self._device.type == "cpu" and "OMP_NUM_THREADS" not in os.environ:
+            # The count holds for the whole process: a larger model made after a small one must not stay on its one thread.
+            torch.set_num_threads(1 if config.deter <= SMALL else _THREADS)
         if self._device.type == "cuda":
             # [LAY-1]: TensorFloat-32 is not float32. Convolutions would use it unasked.
             torch.set_float32_matmul_precision("highest")
@@ -66,7 +69,10 @@ class Learner:
     def policy(
         self, observation: Arrays, is_first: np.ndarray, carry: Mapping[str, Tensor], seed: int
     ) -> tuple[np.ndarray, Arrays, dict[str, Tensor]]:
-        """One acting step: observation {key: [N, ...]}, is_first [N], seed of the noise -> (action [N, A], latents, carry). [AGT-11]"""
+        """One acting step: observation {key: [N, ...]}, is_first [N], seed of the noise -> (action [N, A], latents, carry). [AGT-11]
+
+        The latents may still be on their way.
+        """
         generator = self._generator(seed)
         noise = {
             "posterior": self._uniform(generator, len(is_first), self.config.stoch),
@@ -78,8 +84,9 @@ class Learner:
         state, action = policy_step(
             self._acting, carry, carry["action"], inputs, self._to_device(is_first), noise, self.spaces, self.config
         )
-        latents = {"deter": state["deter"].float().cpu().numpy(), "stoch": state["stoch"].argmax(-1).cpu().numpy()}
-        return action.float().cpu().numpy(), latents, state | {"action": action}
+        taken = _to_host(action.float())  # on its way before the latents, which nobody waits for here
+        latents = {"deter": _to_host(state["deter"].float()), "stoch": _to_host(state["stoch"].argmax(-1))}
+        return np.asarray(taken), latents, state | {"action": action}
 
     def train_step(self, batch: Arrays, seed: int) -> tuple[dict[str, Any], dict[str, Any]]:
         """One gradient step on a replay batch, with the noise of a seed: metrics by name, latents to write back. [AGT-29] [AGT-30]"""
@@ -196,9 +203,10 @@ def select_device(device: str | None) -> torch.device:
     """
     if device is None:
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    kind, _, index = device.replace("gpu", "cuda").partition(":")
-    if kind not in ("cpu", "cuda") or (index and not index.isdigit()):
-        raise ValueError(f"unknown device {device!r}; expected cpu, gpu, cuda or cuda:<number>")
+    match = re.fullmatch(r"(cpu)|(?:gpu|cuda)(?::([0-9]+))?", device)
+    if match is None:
+        raise ValueError(f"unknown device {device!r}; expected cpu, gpu, cuda, gpu:<number> or cuda:<number>")
+    kind, index = match[1] or "cuda", match[2]
     if kind == "cuda" and int(index or 0) >= torch.cuda.device_count():
         build = "a build for CPUs only" if torch.version.cuda is None and torch.version.hip is None else f"{torch.cuda.device_count()} GPUs"
         raise ValueError(
@@ -212,8 +220,8 @@ class _Copying:
 
     def __init__(self, x: Tensor) -> None:
         self._host = torch.empty(x.shape, dtype=x.dtype, pin_memory=True).copy_(x, non_blocking=True)
-        self._done = torch.cuda.Event()
-        self._done.record()
+        # Of the stream that copies: without one, an event belongs to the current device, which may be another.
+        self._done = torch.cuda.current_stream(x.device).record_event()
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
         self._done.synchronize()

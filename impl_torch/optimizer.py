@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from impl_torch.parameters import ROW, Layout
-from impl_torch.shapes import expect, expect_keys, expect_same_shape, expect_shape, wide_dtype
+from impl_torch.shapes import expect, expect_keys, expect_same_shape, expect_shape, wide_dtype, widen
 from spec import Config
 
 DEAD_ZONE = 1e-16  # [OPT-9]
@@ -37,6 +37,7 @@ def _clip_factor(gradient_norm: Tensor, parameter_norm: Tensor, clip: float, eps
 @torch.no_grad()
 def adaptive_gradient_clip(gradient: Tensor, parameter: Tensor, clip: float, epsilon: float) -> Tensor:
     """The gradient, no longer than clip * max(epsilon, norm(parameter)); any shape. [OPT-1] to [OPT-5]"""
+    gradient, parameter = widen(gradient), widen(parameter)  # [OPT-19]
     expect_same_shape(parameter=parameter, gradient=gradient)
     return gradient * _clip_factor(_norm(gradient), _norm(parameter), clip, epsilon)
 
@@ -55,23 +56,26 @@ def clip_flat_gradients_(gradients: Tensor, parameters: Tensor, layout: Layout, 
 
     gradients, parameters [total]. Returns the norm of each tensor's gradient before clipping [P] and the factors [P].
     """
-    counts, owner = layout.row_counts(gradients.device)
-    norms, parameter_norms = (_segment_norms(x.view(-1, ROW), counts, owner) for x in (gradients, parameters))
+    norms, parameter_norms = (_norms(x.view(-1, ROW), layout) for x in (gradients, parameters))
     factors = _clip_factor(norms, parameter_norms, clip, epsilon)
-    gradients.view(-1, ROW).mul_(factors.to(gradients.dtype)[owner].unsqueeze(-1))
+    gradients.view(-1, ROW).mul_(factors.to(gradients.dtype)[layout.owners(gradients.device)].unsqueeze(-1))
     return norms, factors
 
 
-def _segment_norms(rows: Tensor, counts: Tensor, owner: Tensor) -> Tensor:
-    """Norm of each tensor [P], float64, from its rows [R, ROW]. [OPT-3]"""
-    if rows.dtype == torch.float64:
-        peaks = torch.linalg.vector_norm(rows, math.inf, dim=1)
-        norms = peaks * torch.linalg.vector_norm(rows / torch.where(peaks == 0, 1, peaks).unsqueeze(-1), dim=1)
-    else:
-        norms = torch.linalg.vector_norm(rows, dim=1, dtype=torch.float64)  # the square of no float32 overflows in float64
-    peaks = torch.segment_reduce(norms, "max", lengths=counts, unsafe=True)
-    safe = torch.where(peaks == 0, 1, peaks)
-    return peaks * torch.segment_reduce(torch.square(norms / safe[owner]), "sum", lengths=counts, unsafe=True).sqrt()
+def _norms(rows: Tensor, layout: Layout) -> Tensor:
+    """Norm of each tensor [P], float64, from the rows of a flat buffer [R, ROW]: of its rows, of the norms of its rows, and so on."""
+    pieces = rows.split(CHUNK // ROW) if rows.device.type == "cpu" else [rows]
+    norms = torch.cat([_row_norms(piece) for piece in pieces])
+    for size, places in layout.folds(rows.device):
+        norms = _row_norms(norms.new_zeros(size).index_copy_(0, places, norms).view(-1, ROW))
+    return norms
+
+
+def _row_norms(rows: Tensor) -> Tensor:
+    """Norm of each row [R], float64. [OPT-3]"""
+    peaks = rows.abs().amax(1, keepdim=True)  # PyTorch's infinity norm takes twenty times as long
+    norms = torch.linalg.vector_norm(rows / torch.where(peaks == 0, 1, peaks), dim=1, keepdim=True)
+    return (peaks.double() * norms.double()).squeeze(1)
 
 
 def learning_rate(step: int, config: Config) -> float:
@@ -115,7 +119,8 @@ def laprop(gradient: Tensor, second_moment: Tensor, momentum: Tensor, step: int,
 class LaProp(torch.optim.Optimizer):
     """LaProp: RMSProp's normalization first, momentum afterwards. [OPT-8] to [OPT-16] [OPT-20]
 
-    Per parameter the state is "step" (int), "second_moment" and "momentum". No weight decay, and no clipping: see `clip_gradients_`.
+    Per parameter the state is "step" (int), "second_moment" and "momentum", in float32 or better also for narrower parameters. [OPT-19]
+    No weight decay, and no clipping: see `clip_gradients_`.
 
     Raises:
       ValueError: a beta outside [0, 1).
@@ -139,11 +144,21 @@ class LaProp(torch.optim.Optimizer):
                     self._update(parameter, parameter.grad, group)
         return loss
 
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """As that of any optimizer, which would round the moments to the dtype of the parameters."""
+        super().load_state_dict(state_dict)
+        saved = (state_dict["state"].get(index, {}) for group in state_dict["param_groups"] for index in group["params"])
+        parameters = (parameter for group in self.param_groups for parameter in group["params"])
+        for parameter, state in zip(parameters, saved, strict=True):
+            for name in {"second_moment", "momentum"} & set(state):
+                self.state[parameter][name] = state[name].detach().clone().to(parameter.device)
+
     def _update(self, parameter: Tensor, gradient: Tensor, group: dict[str, Any]) -> None:
         state = self.state[parameter]
         if not state:
-            state |= {"step": 0, "second_moment": torch.zeros_like(parameter), "momentum": torch.zeros_like(parameter)}
-        tensors = (gradient, state["second_moment"], state["momentum"], parameter)
+            dtype = torch.promote_types(parameter.dtype, torch.float32)
+            state |= {"step": 0, **{name: torch.zeros_like(parameter, dtype=dtype) for name in ("second_moment", "momentum")}}
+        tensors = (gradient.to(state["momentum"].dtype), state["second_moment"], state["momentum"], parameter)
         chunks: Iterable[Any] = _chunks(*tensors) if parameter.device.type == "cpu" else [tensors]
         for chunk in chunks:
             _laprop_(chunk, state["step"], group["betas"], group["eps"], group["lr"])

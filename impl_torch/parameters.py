@@ -26,7 +26,8 @@ class Layout:
         self.sizes = {name: math.prod(shape) for name, shape in self.shapes.items()}
         self.rows = {name: -(-size // ROW) for name, size in self.sizes.items()}
         self.total = ROW * sum(self.rows.values())
-        self._row_counts: dict[torch.device, tuple[Tensor, Tensor]] = {}
+        self._owners: dict[torch.device, Tensor] = {}
+        self._folds: dict[torch.device, list[tuple[int, Tensor]]] = {}
 
     def views(self, flat: Tensor) -> dict[str, Tensor]:
         """name -> its part of flat [total] in its own shape, the same memory."""
@@ -41,12 +42,27 @@ class Layout:
             pieces += [x.reshape(-1), x.new_zeros(gap)] if gap else [x.reshape(-1)]
         return torch.cat(pieces, out=out)
 
-    def row_counts(self, device: torch.device) -> tuple[Tensor, Tensor]:
-        """How many rows each tensor has [P], and which tensor each row belongs to [total / ROW]."""
-        if device not in self._row_counts:
+    def owners(self, device: torch.device) -> Tensor:
+        """Which tensor each row belongs to: [total / ROW]."""
+        if device not in self._owners:
             counts = torch.tensor(list(self.rows.values()), device=device)
-            self._row_counts[device] = counts, torch.arange(len(counts), device=device).repeat_interleave(counts)
-        return self._row_counts[device]
+            self._owners[device] = torch.arange(len(counts), device=device).repeat_interleave(counts)
+        return self._owners[device]
+
+    def folds(self, device: torch.device) -> list[tuple[int, Tensor]]:
+        """How to get from one number for each row to one number for each tensor, a row of numbers becoming one each time.
+
+        A fold is the size of a buffer and the places in it of the numbers; its other places hold zeros. Unlike a sum by owners, which
+        adds in any order on a GPU, this always gives the same sum.
+        """
+        if device not in self._folds:
+            self._folds[device], layout = [], self
+            while max(layout.rows.values()) > 1:
+                layout = Layout({name: (rows,) for name, rows in layout.rows.items()})
+                places = torch.arange(layout.total).split([ROW * rows for rows in layout.rows.values()])
+                used = torch.cat([place[:size] for place, size in zip(places, layout.sizes.values(), strict=True)])
+                self._folds[device].append((layout.total, used.to(device)))
+        return self._folds[device]
 
 
 class Parameters(nn.Module):

@@ -44,6 +44,8 @@ class ReplayRatio:
         if self._step is not None and step < self._step:
             raise ValueError(f"environment steps cannot go back: got {step} after {self._step}")
         if self._ratio == 0:
+            if self._step is not None:
+                self._step = step  # another ratio later does not pay for these steps
             return 0
         if self._step is None:
             self._step = step

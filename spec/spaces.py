@@ -72,7 +72,7 @@ class Image:
 
 
 _KEY = re.compile(r"[A-Za-z0-9_-]+")
-_RESERVED = frozenset({"reward", "is_first", "is_last", "is_terminal", "prev_action", "action", "deter", "stoch"})
+_RESERVED = frozenset({"reward", "is_first", "is_last", "is_terminal", "prev_action", "action", "deter", "stoch", "ids"})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,7 +80,7 @@ class Spaces:
     """The observations and actions of a task.
 
     Raises:
-      ValueError: no observation or no action, a key that cannot name a parameter or that the record of a step uses itself, or images
+      ValueError: no observation or no action, a key that cannot name a parameter or that a record or a batch uses itself, or images
         of different sizes.
     """
 
@@ -96,7 +96,7 @@ class Spaces:
             if not _KEY.fullmatch(key):
                 raise ValueError(f"the key {key!r} may hold only letters, digits, '_' and '-'")
         for key in sorted(_RESERVED.intersection(self.observations)):
-            raise ValueError(f"the observation key {key!r} is reserved for the record of a step; rename it")
+            raise ValueError(f"the observation key {key!r} is reserved for records and batches; rename it")
         if len({(image.height, image.width) for image in self.images.values()}) > 1:
             raise ValueError(f"all images must share height and width, got {self.images}")
 
@@ -133,16 +133,3 @@ class Spaces:
             "observations": {key: describe(space) for key, space in self.observations.items()},
             "actions": {key: describe(space) for key, space in self.actions.items()},
         }
-
-    @classmethod
-    def from_json(cls, description: Mapping[str, Any]) -> "Spaces":
-        """The inverse of `to_json`."""
-
-        def build(entry: Mapping[str, Any]) -> Any:
-            fields = {name: tuple(value) if isinstance(value, list) else value for name, value in entry.items() if name != "kind"}
-            return {"vector": Vector, "discrete": Discrete, "image": Image}[entry["kind"]](**fields)
-
-        return cls(
-            {key: build(entry) for key, entry in description["observations"].items()},
-            {key: build(entry) for key, entry in description["actions"].items()},
-        )

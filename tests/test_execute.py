@@ -4,7 +4,9 @@ import types
 from typing import Any
 
 import numpy as np
+import pytest
 
+from conformance.cli import main
 from conformance.execute import missing, run_check, selected_checks
 
 CHECKS = {check.name: check for check in selected_checks("float64")}
@@ -40,3 +42,22 @@ def test_a_right_and_a_wrong_function() -> None:
     assert right.status == "pass", right.message
     wrong = run_check(check, adapter(symlog=lambda x: np.sign(x) * np.log(np.abs(x))), "float64", "paper")
     assert (wrong.status, "symlog" in wrong.message) == ("fail", True)
+
+
+def test_two_deviations_are_a_deviation() -> None:
+    """A property that fails in two ways is a failure with the smaller case, not an error with a group of them."""
+
+    def two_mistakes(x: np.ndarray) -> np.ndarray:
+        right = np.sign(x) * np.log1p(np.abs(x))
+        return right[..., None] if np.ndim(x) > 1 else right + 1
+
+    result = run_check(CHECKS["transforms.symlog_matches"], adapter(symlog=two_mistakes), "float64", "paper", examples=200)
+    assert result.status == "fail", result.message
+
+
+def test_a_device_that_is_not_there(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", "--backend", "torch", "--device", "abacus"]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("conformance: error: ")
+    assert "abacus" in error
+    assert error.count("\n") == 1

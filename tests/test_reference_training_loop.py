@@ -40,6 +40,20 @@ def test_ratio_may_jump_and_stand_still():
 def test_ratio_zero_never_trains():
     ratio = ReplayRatio(0.0, 1024)
     assert [ratio(step) for step in range(5)] == [0] * 5
+    assert ratio.state_dict()["step"] is None
+
+
+def test_a_pause_with_ratio_zero_is_not_paid_for():
+    """Ratio 1 to step 1000, ratio 0 to step 200 000, then ratio 1: the 199 000 steps in between give no credit."""
+    first, pause, second = ReplayRatio(1.0, 1024), ReplayRatio(0.0, 1024), ReplayRatio(1.0, 1024)
+    assert [first(0), first(1000)] == [1, 0]
+    pause.load_state_dict(first.state_dict())
+    assert [pause(step) for step in (1000, 50_000, 200_000)] == [0, 0, 0]
+    assert pause.state_dict() == {"step": 200_000, "credit": "1000"}
+    with pytest.raises(ValueError, match="back"):
+        pause(199_999)
+    second.load_state_dict(pause.state_dict())
+    assert [second(200_000), second(200_023), second(200_024)] == [0, 0, 1]
 
 
 def test_ratio_is_saved_exactly():

@@ -12,10 +12,10 @@ import pytest
 from train_fakes import FakeLearner
 
 import train.setup
-from spec import hyperparameters
+from spec import benchmarks, hyperparameters, load_config
 from train.cli import build_parser, main, parse
 from train.errors import UserError
-from train.options import presets
+from train.options import make_options, presets
 
 SMALL = {"deter": 8, "units": 4, "stoch": 2, "classes": 2, "batch-size": 2, "batch-length": 3, "envs": 2}
 SHORT = {"steps": 60, "eval-every": 0, "eval-episodes": 1, "random-episodes": 1}
@@ -212,3 +212,11 @@ def test_the_command_itself_says_one_line() -> None:
     assert done.stderr.count("\n") == 1
     assert done.stderr.startswith("train: error: hyperparameter batch_size is -1")
     assert np.all(done.stdout == "")
+
+
+@pytest.mark.parametrize("name", ["dmc_proprio", "dmc_vision"])
+def test_presets_of_the_papers_protocols_have_its_numbers(name: str) -> None:
+    protocol, options = benchmarks()[name], make_options("jax", {}, {}, name)
+    assert (options.steps, options.action_repeat) == (protocol["steps"], protocol["action_repeat"])
+    assert (options.config.envs, options.config.replay_ratio) == (protocol["envs"], protocol["replay_ratio"])
+    assert options.config == load_config("paper", protocol["size"], envs=protocol["envs"], replay_ratio=protocol["replay_ratio"])

@@ -1,6 +1,8 @@
 """Spaces, values, records and errors of the environments behind `train`."""
 
 import functools
+import os
+import signal
 import sys
 
 import gymnasium
@@ -34,7 +36,7 @@ TWO = gym.Discrete(2)
         (gym.MultiBinary((2, 2)), Discrete((2, 2, 2, 2))),
     ],
 )
-@pytest.mark.covers("CON-28")
+@pytest.mark.covers("CON-28", "LOOP-31")
 def test_observation_spaces(space: gymnasium.Space, expected: object) -> None:
     assert translate(space, TWO).spaces.observations == {"observation": expected}
 
@@ -43,6 +45,7 @@ def test_observation_spaces(space: gymnasium.Space, expected: object) -> None:
     ("space", "expected"),
     [(gym.Box(-1, 1, (2, 3)), Vector(6)), (gym.Discrete(4, start=-1), Discrete((4,))), (gym.MultiDiscrete([2, 3]), Discrete((2, 3)))],
 )
+@pytest.mark.covers("LOOP-31")
 def test_action_spaces(space: gymnasium.Space, expected: object) -> None:
     assert translate(TWO, space).spaces.actions == {"action": expected}
 
@@ -66,6 +69,7 @@ def test_unsupported_spaces_are_named(observation: gymnasium.Space, action: gymn
     assert all(word in str(error.value) for word in words), error.value
 
 
+@pytest.mark.covers("LOOP-31")
 def test_every_kind_of_observation_becomes_its_array() -> None:
     env = ContractEnv(train_fakes.Everything(), "t")
     observation, _ = env.reset()
@@ -115,6 +119,24 @@ def test_a_fourth_channel_is_not_opacity() -> None:
     assert np.ptp(first[..., 0]) > 0
 
 
+@pytest.mark.parametrize(("height", "width", "channels"), [(210, 160, 3), (100, 31, 1), (20, 30, 4), (64, 90, 3)])
+@pytest.mark.covers("LOOP-30")
+def test_images_are_resized_bilinearly(height: int, width: int, channels: int) -> None:
+    """Down and up, in every channel: a triangle around each output pixel's centre, as wide as two pixels of the coarser image."""
+
+    def weights(old: int, new: int) -> np.ndarray:
+        distance = np.arange(old) + 0.5 - (np.arange(new)[:, None] + 0.5) * old / new
+        triangle = np.maximum(0, 1 - np.abs(distance) / max(1, old / new))
+        return triangle / triangle.sum(1, keepdims=True)
+
+    image = np.random.default_rng(0).integers(0, 256, (height, width, channels), np.uint8)
+    resized = translate(gym.Box(0, 255, image.shape, np.uint8), TWO).observation(image)["observation"]
+    exact = np.einsum("yi,xj,ijc->yxc", weights(height, 64), weights(width, 64), image.astype(float))
+    assert resized.dtype == np.uint8
+    assert np.abs(resized - exact).max() < 1.5
+
+
+@pytest.mark.covers("LOOP-30")
 def test_an_image_of_the_right_size_is_only_copied() -> None:
     image = np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8)
     adapted = translate(gym.Box(0, 255, (64, 64, 3), np.uint8), TWO).observation(image)["observation"]
@@ -140,7 +162,7 @@ def _records(processes: bool, steps: int = 11, action_repeat: int = 1) -> list[d
 
 
 @pytest.mark.parametrize("processes", [False, True])
-@pytest.mark.covers("LOOP-2", "LOOP-7", "LOOP-10", "LOOP-11", "CON-9", "CON-10", "CON-11")
+@pytest.mark.covers("LOOP-2", "LOOP-7", "LOOP-10", "LOOP-11", "LOOP-29", "CON-9", "CON-10", "CON-11")
 def test_each_observation_is_one_record(processes: bool) -> None:
     """Two episodes and the start of a third; the first terminates, the second is truncated. Nothing is lost, nothing comes twice."""
     stream = [{key: value[1] for key, value in record.items()} for record in _records(processes)]
@@ -152,12 +174,64 @@ def test_each_observation_is_one_record(processes: bool) -> None:
     assert stream[0]["reward"].dtype == np.float32
 
 
-@pytest.mark.covers("LOOP-5")
+@pytest.mark.covers("LOOP-5", "LOOP-27")
 def test_action_repeat_sums_rewards_and_stops_at_the_end() -> None:
     stream = [{key: value[0] for key, value in record.items()} for record in _records(False, steps=4, action_repeat=3)]
     assert [record["observation"][1] for record in stream] == [0, 3, 4, 0, 3]
     assert [record["reward"] for record in stream] == [0, 1 + 2 + 3, 4, 0, 11 + 12 + 13]
     assert [record["is_last"] for record in stream] == [False, False, True, False, False]
+
+
+@pytest.mark.parametrize("processes", [False, True])
+@pytest.mark.covers("LOOP-27", "LOOP-29")
+def test_action_repeat_is_the_same_in_every_episode(processes: bool) -> None:
+    """The first episode terminates, the second is truncated, both in the middle of a repetition; a third begins."""
+    stream = [{key: value[1] for key, value in record.items()} for record in _records(processes, steps=7, action_repeat=3)]
+    assert [tuple(record["observation"]) for record in stream] == [(e, t) for e in (0, 1) for t in (0, 3, 4)] + [(2, 0), (2, 3)]
+    assert [record["reward"] for record in stream] == [0, 6, 4, 0, 36, 14, 0, 66]
+    assert [t for t, record in enumerate(stream) if record["is_first"]] == [0, 3, 6]
+    assert [t for t, record in enumerate(stream) if record["is_last"]] == [2, 5]
+    assert [t for t, record in enumerate(stream) if record["is_terminal"]] == [2]
+
+
+def _limited(inner: type[train_fakes.Counting], limit: int, action_repeat: int, steps: int) -> list[dict[str, np.ndarray]]:
+    envs = Environments(
+        lambda index: ContractEnv(gymnasium.wrappers.TimeLimit(inner(), limit), "t", index, action_repeat=action_repeat), 1, False
+    )
+    return [envs.reset([0]), *(envs.step(np.zeros((1, 2), np.float32)) for _ in range(steps))]
+
+
+@pytest.mark.parametrize(("action_repeat", "times"), [(1, [0, 1, 2, 3, 4, 5]), (2, [0, 2, 4, 5]), (3, [0, 3, 5]), (9, [0, 5])])
+@pytest.mark.covers("LOOP-28")
+def test_a_time_limit_counts_frames_and_truncates(action_repeat: int, times: list[int]) -> None:
+    records = _limited(train_fakes.Endless, limit=5, action_repeat=action_repeat, steps=2 * len(times) - 1)
+    assert [record["observation"][0, 1] for record in records] == 2 * times
+    assert [record["is_last"][0] for record in records] == 2 * [time == 5 for time in times]
+    assert not any(record["is_terminal"][0] for record in records)
+
+
+@pytest.mark.covers("LOOP-28", "LOOP-10")
+def test_an_end_at_the_time_limit_is_terminal() -> None:
+    records = _limited(train_fakes.Counting, limit=train_fakes.EPISODE, action_repeat=1, steps=9)
+    assert [t for t, record in enumerate(records) if record["is_last"][0]] == [4, 9]
+    assert [t for t, record in enumerate(records) if record["is_terminal"][0]] == [4], "the second episode is only truncated"
+
+
+@pytest.mark.covers("LOOP-29")
+def test_only_the_first_reset_gets_a_seed() -> None:
+    """With a seed at each reset, every episode would be the same one."""
+    resets: list[tuple[int, int | None]] = []
+
+    class Diary(train_fakes.Counting):
+        def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple:
+            resets.append((self._time, seed))
+            return super().reset(seed=seed)
+
+    envs = Environments(lambda index: ContractEnv(Diary(), "t", index), 2, False)
+    envs.reset([5, 6])
+    for _ in range(2 * (train_fakes.EPISODE + 1)):
+        envs.step(np.zeros((2, 2), np.float32))
+    assert resets == [(0, 5), (0, 6)] + 4 * [(train_fakes.EPISODE, None)]
 
 
 @pytest.mark.parametrize("processes", [False, True])
@@ -206,7 +280,7 @@ def test_seeds_decide_what_happens() -> None:
     assert first([1, 2]) != first([1, 3])
 
 
-@pytest.mark.covers("LOOP-10", "CON-11")
+@pytest.mark.covers("LOOP-10", "LOOP-28", "CON-11")
 def test_a_time_limit_of_gymnasium_is_no_termination() -> None:
     envs = Environments(functools.partial(make_env, "gym:Pendulum-v1"), 1, False)
     envs.reset([0])
@@ -242,6 +316,7 @@ def test_random_actions_are_legal_and_cover_the_choices() -> None:
         ({"values": 4}, ["4 values", "terminated, truncated"]),
     ],
 )
+@pytest.mark.covers("LOOP-31")
 def test_what_the_space_does_not_allow_is_refused(wrong: dict, words: list[str]) -> None:
     env = ContractEnv(train_fakes.Faulty(3, **wrong), "my:task", index=5)
     env.reset()
@@ -263,6 +338,7 @@ def test_what_the_space_does_not_allow_is_refused(wrong: dict, words: list[str])
         ("arm", 3, ["'arm'", "int", "angle, touch"]),
     ],
 )
+@pytest.mark.covers("LOOP-31")
 def test_wrong_entries_are_named(key: str, value: object, words: list[str]) -> None:
     inner = train_fakes.Everything()
     observation = inner.observation()
@@ -280,6 +356,37 @@ def test_errors_come_through_worker_processes(processes: bool) -> None:
             _records_of(envs, 12)
     finally:
         envs.close()
+
+
+@pytest.mark.parametrize("victim", [0, 1])
+def test_a_worker_that_dies_is_an_error_and_no_hang(victim: int) -> None:
+    envs = Environments(functools.partial(make_env, "train_fakes:Sleepy"), 2, True)
+    envs.reset([0, 1])
+    envs.start(np.zeros((2, 2), np.float32))
+    envs._envs.processes[victim].kill()
+    with pytest.raises(UserError, match="ended unexpectedly"):
+        envs.finish()
+    envs.close()
+    assert not any(process.is_alive() for process in envs._envs.processes)
+
+
+def test_workers_outlive_the_signals_that_are_for_the_trainer() -> None:
+    """Sent to the whole process group, they must not end the workers before the trainer has saved."""
+    envs = Environments(functools.partial(make_env, "train_fakes:Counting"), 2, True)
+    envs.reset([0, 1])
+    for process in envs._envs.processes:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            os.kill(process.pid, number)
+    assert envs.step(np.zeros((2, 2), np.float32))["reward"].tolist() == [1, 1]
+    envs.close()
+
+
+def test_repeated_rewards_that_float32_cannot_hold_are_refused() -> None:
+    env = ContractEnv(train_fakes.Faulty(1, reward=3e38), "t", action_repeat=2)
+    env._env.step = lambda action: (np.zeros(2, np.float32), 3e38, False, False, {})
+    env.reset()
+    with pytest.raises(UserError, match="2 repeated actions add up"):
+        env.step(np.zeros(2, np.float32))
 
 
 def test_errors_of_the_environments_own_code_keep_their_traceback() -> None:
@@ -320,6 +427,7 @@ def test_a_missing_package_of_gymnasium_says_what_to_install(monkeypatch: pytest
         make_env("gym:HalfCheetah-v5")
 
 
+@pytest.mark.covers("LOOP-28")
 def test_dm_control_from_vectors() -> None:
     pytest.importorskip("dm_control")
     env = make_env("dmc:cartpole-balance", action_repeat=2)
@@ -335,3 +443,13 @@ def test_dm_control_from_vectors() -> None:
     assert 0 < reward <= 2
     with pytest.raises(UserError, match="known: cartpole-balance"):
         make_env("dmc:cartpole-fly")
+
+
+@pytest.mark.covers("LOOP-27")
+def test_every_repeat_gets_the_same_action() -> None:
+    """`Counting` writes into the actions that it is given."""
+    inner = train_fakes.Counting()
+    env = ContractEnv(inner, "t", action_repeat=3)
+    env.reset()
+    env.step(np.float32([0.0, 0.5]))
+    assert [action.tolist() for action in inner.actions] == [[5, 0.5]] * 3

@@ -20,6 +20,7 @@ from train.envs import Environments, make_env
 from train.errors import UserError
 from train.logger import read_metrics
 from train.options import Options, make_options
+from train.schedule import save
 
 SMALL = {"deter": 8, "units": 4, "stoch": 2, "classes": 2, "batch_size": 2, "batch_length": 3, "envs": 2, "replay_capacity": 500}
 BATCH_STEPS = SMALL["batch_size"] * SMALL["batch_length"]
@@ -370,6 +371,30 @@ def test_a_checkpoint_is_complete_or_absent(make: Make, monkeypatch: pytest.Monk
     assert [path.name for path in (make().logdir / "checkpoints").iterdir()] == ["000000000090"]
 
 
+def test_a_save_spares_what_is_not_ours(make: Make) -> None:
+    directory = make().logdir / "checkpoints"
+    (directory / "best").mkdir(parents=True)
+    (directory / ".DS_Store").touch()
+    loop.run(make(), FakeLearner)
+    assert sorted(path.name for path in directory.iterdir()) == [".DS_Store", "000000000060", "best"]
+
+
+@pytest.mark.covers("LOOP-22")
+def test_a_step_that_is_saved_again_is_never_without_a_checkpoint(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    with ExitStack() as stack:
+        state = setup.prepare(make(), FakeLearner, stack)
+        loop.train(state)
+        path = save(state)
+        rename = Path.rename
+        monkeypatch.setattr(Path, "rename", lambda self, target: rename(self, target) if target.name.endswith(".old") else 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            save(state)
+    found = checkpoint.find(make().logdir)
+    assert found
+    assert found.path.name == f"{path.name}.old"
+    assert found.replay["items"].size
+
+
 @pytest.mark.parametrize("name", ["learner.safetensors", "replay.safetensors", "run.json"])
 def test_a_damaged_checkpoint_is_named(make: Make, name: str) -> None:
     loop.run(make(), FakeLearner)
@@ -394,6 +419,64 @@ def test_the_first_interrupt_saves(make: Make, monkeypatch: pytest.MonkeyPatch) 
     assert saved
     assert saved.info["counters"]["records"] == 42
     assert signal.getsignal(signal.SIGINT) is handler
+
+
+def test_an_interrupt_abandons_an_evaluation(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Evaluation is due at step 20, after 10 policy steps; the signal comes in its second step."""
+    policy = FakeLearner.policy
+
+    def interrupt(self: FakeLearner, *arguments: Any) -> Any:
+        if sum(kind == "policy" for kind, _ in FakeLearner.diary) == 11:
+            os.kill(os.getpid(), signal.SIGINT)
+        return policy(self, *arguments)
+
+    monkeypatch.setattr(FakeLearner, "policy", interrupt)
+    options = make(eval_every=20, eval_episodes=40)
+    assert not loop.run(options, FakeLearner)
+    saved = checkpoint.find(options.logdir)
+    assert saved
+    assert saved.info["counters"]["records"] == 20
+    assert (saved.info["counters"]["evaluations"], saved.info["evaluation"]) == (0, None)
+    assert not any("evaluation/return" in line for line in read_metrics(options.logdir / "metrics.jsonl"))
+
+
+def test_what_ends_the_last_evaluation_does_not_cost_the_training(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: Any) -> list[float]:
+        raise KeyboardInterrupt
+
+    options = make(eval_episodes=2)
+    with monkeypatch.context() as patch:
+        patch.setattr("train.schedule.evaluate", fail)
+        with pytest.raises(KeyboardInterrupt):
+            loop.run(options, FakeLearner)
+    saved = checkpoint.find(options.logdir)
+    assert saved
+    assert saved.info["counters"]["records"] == 60
+    FakeLearner.diary.clear()
+    assert loop.run(options, FakeLearner)
+    assert batches() == []
+    assert any("evaluation/return" in line for line in read_metrics(options.logdir / "metrics.jsonl"))
+
+
+def test_evaluation_refuses_an_action_that_is_not_finite(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("train.evaluation.Agent.__call__", lambda self, record: np.full((2, 2), np.nan))
+    with pytest.raises(UserError, match="diverged: the policy's action"):
+        loop.run(make(eval_episodes=2), FakeLearner)
+
+
+def test_a_gradient_that_is_not_finite_is_not_saved(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    train_step = FakeLearner.train_step
+
+    def overflow(self: FakeLearner, *arguments: Any) -> Any:
+        metrics, latents = train_step(self, *arguments)
+        return {**metrics, "gradient_norm": np.float32(np.inf)}, latents
+
+    monkeypatch.setattr(FakeLearner, "train_step", overflow)
+    options = make(log_every=1e9)
+    with pytest.raises(UserError, match="diverged: gradient_norm is not finite") as error:
+        loop.run(options, FakeLearner)
+    assert checkpoint.find(options.logdir) is None
+    assert "from before" not in str(error.value)
 
 
 @pytest.mark.covers("LOOP-24")

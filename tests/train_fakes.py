@@ -1,5 +1,6 @@
 """Environments and a learner that the tests of `train` look through: every number that comes out says where it came from."""
 
+import time
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -111,6 +112,14 @@ class Sequences(Counting):
 class Endless(Counting):
     def step(self, action: np.ndarray) -> Any:
         return (*super().step(action)[:2], False, False, {})
+
+
+class Sleepy(Counting):
+    """Takes a while for a step, so that its process can be killed in the middle of it."""
+
+    def step(self, action: np.ndarray) -> Any:
+        time.sleep(0.5)
+        return super().step(action)
 
 
 def nan_observation() -> gymnasium.Env[Any, Any]:

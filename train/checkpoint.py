@@ -9,6 +9,7 @@ LOGDIR/checkpoints/<environment step>/
 import dataclasses
 import json
 import os
+import re
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,6 +22,7 @@ from safetensors.numpy import load_file, save_file
 from train.errors import UserError
 
 FORMAT = 1
+OURS = re.compile(r"\d{12}(\.tmp|\.old)?")  # .tmp: being written; .old: about to be replaced by the same step
 
 Arrays = dict[str, np.ndarray]
 
@@ -57,11 +59,11 @@ def save(logdir: Path, step: int, learner: Mapping[str, Any], replay: Mapping[st
         (temporary / "run.json").write_text(json.dumps({"format": FORMAT, **info}, indent=2) + "\n", encoding="utf-8")
         for file in temporary.iterdir():
             _flush_to_disk(file)
-        if final.exists():  # The same step again: made by a run that was resumed and did nothing.
-            shutil.rmtree(final)
+        if final.exists():  # The same step again, as before and after the last evaluation.
+            final.rename(directory / f"{step:012d}.old")
         temporary.rename(final)
         for other in directory.iterdir():
-            if other != final:
+            if other != final and OURS.fullmatch(other.name):
                 shutil.rmtree(other)
     except (OSError, SafetensorError) as error:
         raise UserError(f"cannot write the checkpoint {final}: {error}") from error
@@ -74,7 +76,8 @@ def find(logdir: Path) -> Checkpoint | None:
     Raises:
       UserError: a checkpoint that cannot be read, or of another format.
     """
-    paths = sorted(path for path in (logdir / "checkpoints").glob("*") if path.name.isdigit())
+    found = (path for path in (logdir / "checkpoints").glob("*") if OURS.fullmatch(path.name) and path.suffix != ".tmp")
+    paths = sorted(found, key=lambda path: (path.stem, path.suffix == ""))
     if not paths:
         return None
     try:

@@ -1,6 +1,6 @@
 """Episodes that are played but not learned from: evaluation of the agent, and what a random policy gets."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,13 +15,18 @@ LONGEST_EPISODE = 108_000  # records
 Act = Callable[[Record], np.ndarray]
 
 
-def play(envs: Environments, act: Act, episodes: int, seeds: list[int]) -> list[float]:
+class Interrupted(Exception):
+    """Somebody asked the run to end."""
+
+
+def play(envs: Environments, act: Act, episodes: int, seeds: list[int], interrupted: Sequence[int] = ()) -> list[float]:
     """The returns of `episodes` whole episodes, undiscounted: [LOOP-20].
 
     Each environment plays its share. The first `episodes` to end, wherever they do, would be the short ones.
 
     Raises:
       UserError: an episode that does not end.
+      Interrupted: `interrupted` is no longer empty.
     """
     share = np.full(envs.count, episodes // envs.count) + (np.arange(envs.count) < episodes % envs.count)
     returns: list[list[float]] = [[] for _ in range(envs.count)]
@@ -35,7 +40,9 @@ def play(envs: Environments, act: Act, episodes: int, seeds: list[int]) -> list[
                 returns[worker].append(float(total[worker]))
         if all(len(scores) == wanted for scores, wanted in zip(returns, share, strict=True)):
             return [score for scores in returns for score in scores]
-        if length.max() > LONGEST_EPISODE:
+        if interrupted:
+            raise Interrupted
+        if length[[len(scores) < wanted for scores, wanted in zip(returns, share, strict=True)]].max() > LONGEST_EPISODE:
             raise UserError(
                 f"an episode did not end within {LONGEST_EPISODE:,} steps, so it has no return; give the environment a time limit "
                 "(gymnasium.wrappers.TimeLimit), or --eval-episodes 0 --random-episodes 0"
@@ -64,10 +71,14 @@ class Agent:
         return np.asarray(action)
 
 
-def evaluate(agent: Agent, envs: Environments, episodes: int, seed: int, earlier: int) -> list[float]:
-    """Returns of the agent as it is now, sampling its actions: [LOOP-18], [LOOP-19]. earlier: evaluations of this run before."""
+def evaluate(act: Act, envs: Environments, episodes: int, seed: int, earlier: int, interrupted: Sequence[int] = ()) -> list[float]:
+    """Returns of the agent as it is now, sampling its actions: [LOOP-18], [LOOP-19]. earlier: evaluations of this run before.
+
+    Raises:
+      Interrupted: `interrupted` is no longer empty.
+    """
     seeds = [derive_seed(seed, "evaluation_environment", worker + envs.count * earlier) for worker in range(envs.count)]
-    return play(envs, agent, episodes, seeds)
+    return play(envs, act, episodes, seeds, interrupted)
 
 
 def play_randomly(envs: Environments, episodes: int, seed: int) -> list[float]:

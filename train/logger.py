@@ -20,13 +20,16 @@ class Logger:
     `episode/return`, `episode/length` (one line per training episode), `evaluation/...`, `train/...` (means since the last such line),
     `speed/...` (per second), `random/return`.
 
-    Lines of steps after `step` are dropped: a run that ended without a checkpoint left them, and the resumed run writes them again.
+    Lines of steps after `step` are dropped: a run that ended without a checkpoint left them, and the resumed run writes them again. Events
+    for TensorBoard stay as they are.
     """
 
     def __init__(self, logdir: Path, step: int) -> None:
         path = logdir / "metrics.jsonl"
         kept = [line for line in read_metrics(path) if line["step"] <= step] if step > 0 else []
-        path.write_text("".join(json.dumps(line) + "\n" for line in kept), encoding="utf-8")
+        temporary = path.with_suffix(".tmp")
+        temporary.write_text("".join(json.dumps(line) + "\n" for line in kept), encoding="utf-8")
+        temporary.replace(path)
         self._file = path.open("a", encoding="utf-8")
         self._tensorboard = Writer(str(logdir))
 

@@ -12,7 +12,7 @@ from reference_numpy.training_loop import can_train, derive_seed
 from train.backend import Learner
 from train.envs import Record
 from train.options import Options
-from train.schedule import Schedule, diverged, finish, log_episode, save, write_back
+from train.schedule import Schedule, finish, finite_action, log_episode, save, write_back
 from train.setup import prepare
 from train.state import Run
 
@@ -43,23 +43,23 @@ def train(run: Run) -> bool:
     record = run.envs.reset(seeds)
     carry = run.learner.initial_carry(run.envs.count)
     scores = Scores(run.envs.count)
-    with _interruptible() as interrupted:
-        while run.step < options.steps and not interrupted:
+    with _interruptible(run.interrupted):
+        while run.step < options.steps and not run.interrupted:
             observation = {key: record[key] for key in run.envs.spaces.observations}
             seed = derive_seed(options.seed, "policy", counters.policy_steps)
             action, latents, carry = run.learner.policy(observation, record["is_first"], carry, seed)
             counters.policy_steps += 1
-            action = _finite_action(run, action)
+            action = finite_action(run, action)
             run.envs.start(action)  # The environments step while the learner trains.
             remember_and_learn(run, record, action, {name: np.asarray(value) for name, value in latents.items()})
             for score, length in scores.update(record):
                 log_episode(run, score, length)
             schedule.attend(run)
             record = run.envs.finish()
-        if interrupted:
+        if run.interrupted:
             path = save(run)
             run.display.say(f"interrupted at step {run.step:,}, saved in {path}; the same command continues from here")
-    return not interrupted
+    return not run.interrupted
 
 
 def remember_and_learn(run: Run, record: Record, action: np.ndarray, latents: Mapping[str, np.ndarray]) -> None:
@@ -87,13 +87,6 @@ def learn(run: Run) -> None:
     run.pending = (ids, latents)
 
 
-def _finite_action(run: Run, action: np.ndarray) -> np.ndarray:
-    action = np.array(action, np.float32)
-    if not np.isfinite(action).all():
-        raise diverged(run, "the policy's action")
-    return action
-
-
 class Scores:
     """Returns and lengths of the episodes under way: [LOOP-20]."""
 
@@ -109,9 +102,8 @@ class Scores:
 
 
 @contextmanager
-def _interruptible() -> Iterator[list[int]]:
-    """A list that the first Ctrl-C or termination signal makes non-empty; the next one works as always."""
-    received: list[int] = []
+def _interruptible(received: list[int]) -> Iterator[None]:
+    """The first Ctrl-C or termination signal is added to the list; the next one works as always."""
     previous: dict[int, Any] = {}
 
     def receive(number: int, frame: FrameType | None) -> None:
@@ -124,7 +116,7 @@ def _interruptible() -> Iterator[list[int]]:
     except ValueError:  # Not in the main thread: signals are somebody else's.
         previous.clear()
     try:
-        yield received
+        yield
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)

@@ -10,8 +10,9 @@ import numpy as np
 
 from train import checkpoint
 from train.curve import draw_curve
+from train.envs import Record
 from train.errors import UserError
-from train.evaluation import Agent, evaluate
+from train.evaluation import Agent, Interrupted, evaluate
 from train.logger import duration
 from train.state import Run
 
@@ -31,6 +32,8 @@ class Schedule:
         self._clock = now
         if now - self._logged_at >= run.options.log_every:
             self._log(run, now)
+        if run.interrupted:
+            return
         if _evaluations_due(run) > self._evaluations_due and run.step < run.options.steps:  # At the end `finish` does it.
             self._evaluations_due = _evaluations_due(run)
             run_evaluation(run)
@@ -74,7 +77,7 @@ def mean_metrics(run: Run) -> dict[str, float]:
     """Means of what the train steps since the last call returned, under `train/`.
 
     Raises:
-      UserError: a loss is not finite.
+      UserError: a loss or the gradient is not finite.
     """
     taken, run.metrics = run.metrics, []
     means = {name: float(np.mean([float(entry[name]) for entry in taken])) for name in (taken[0] if taken else ())}
@@ -84,24 +87,44 @@ def mean_metrics(run: Run) -> dict[str, float]:
 
 def _require_finite(run: Run, metrics: Mapping[str, float]) -> None:
     for name, value in metrics.items():
-        if "loss" in name and not math.isfinite(value):
+        if ("loss" in name or name == "gradient_norm") and not math.isfinite(value):  # [OPT-20]
             raise diverged(run, name)
 
 
 def diverged(run: Run, what: str) -> UserError:
+    saved = f"the checkpoint in {run.options.logdir} is from before; " if checkpoint.find(run.options.logdir) else ""
     return UserError(
         f"training diverged: {what} is not finite at train step {run.counters.train_steps} (step {run.step}); "
-        f"a checkpoint in {run.options.logdir} is from before; try a smaller --learning-rate or another --compute-dtype"
+        f"{saved}try a smaller --learning-rate or another --compute-dtype, with a --logdir of its own"
     )
 
 
+def finite_action(run: Run, action: np.ndarray) -> np.ndarray:
+    """The policy's action in float32. [LOOP-12]
+
+    Raises:
+      UserError: a number is not finite.
+    """
+    action = np.array(action, np.float32)
+    if not np.isfinite(action).all():
+        raise diverged(run, "the policy's action")
+    return action
+
+
 def run_evaluation(run: Run) -> None:
-    """Plays evaluation episodes with the agent as it is."""
+    """Plays evaluation episodes with the agent as it is. An interrupted evaluation leaves nothing behind."""
     options, counters = run.options, run.counters
     if not options.eval_episodes or not run.test_envs:
         return
     agent = Agent(run.learner, run.test_envs, options.seed, counters.evaluation_steps)
-    returns = evaluate(agent, run.test_envs, options.eval_episodes, options.seed, counters.evaluations)
+
+    def act(record: Record) -> np.ndarray:
+        return finite_action(run, agent(record))
+
+    try:
+        returns = evaluate(act, run.test_envs, options.eval_episodes, options.seed, counters.evaluations, run.interrupted)
+    except Interrupted:
+        return
     counters.evaluations += 1
     counters.evaluation_steps = agent.step
     error = float(np.std(returns) / math.sqrt(len(returns)))
@@ -144,6 +167,7 @@ def finish(run: Run) -> None:
     if run.metrics:
         run.logger.write(run.step, run.counters.seconds, mean_metrics(run))
     if run.evaluation is None or run.evaluation["step"] != run.step:
+        save(run)  # An evaluation may take long, and whatever ends it must not cost the training.
         run_evaluation(run)
         save(run)
     options = run.options

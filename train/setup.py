@@ -100,13 +100,14 @@ def _import_learner(backend: str) -> type[Learner]:
 def _make_environments(options: Options, stack: ExitStack) -> tuple[Environments, Environments | None]:
     """The environments of training, and those of evaluation if there is any."""
     make = functools.partial(_make_one, options)
-    slow = is_slow(make, options.seed) if options.processes == "auto" else options.processes == "yes"
-    count = options.config.envs
-    envs = stack.enter_context(closing(Environments(make, count, processes=slow and count > 1)))
+    count, processes = options.config.envs, options.processes == "yes"
+    if options.processes == "auto" and count > 1:
+        processes = is_slow(make, options.seed)
+    envs = stack.enter_context(closing(Environments(make, count, processes)))
     tests = min(count, max(options.eval_episodes, options.random_episodes))
     if not tests:
         return envs, None
-    return envs, stack.enter_context(closing(Environments(make, tests, processes=slow and tests > 1)))
+    return envs, stack.enter_context(closing(Environments(make, tests, processes)))
 
 
 def _make_one(options: Options, index: int) -> ContractEnv:
@@ -117,7 +118,8 @@ def _count_parameters(options: Options, spaces: Spaces) -> int:
     try:
         return sum(math.prod(parameter.shape) for parameter in parameter_table(options.config, spaces).values())
     except ValueError as error:
-        raise UserError(f"task {options.task}: {error}") from error
+        remedy = " (--image-size)" if spaces.images else ""
+        raise UserError(f"task {options.task}: {error}{remedy}") from error
 
 
 def _preflight(options: Options, spaces: Spaces, display: Display) -> None:

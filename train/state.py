@@ -34,6 +34,7 @@ class Run:
     """Everything that a run is made of.
 
     pending: ids and latents of the last train step, not written back yet. metrics: of the train steps since the last line of metrics.
+    interrupted: the signals that asked the run to end.
     """
 
     options: Options
@@ -50,6 +51,7 @@ class Run:
     returns: collections.deque[float] = dataclasses.field(default_factory=lambda: collections.deque(maxlen=20))  # of the last episodes
     pending: tuple[np.ndarray, Mapping[str, Any]] | None = None
     metrics: list[Mapping[str, Any]] = dataclasses.field(default_factory=list)
+    interrupted: list[int] = dataclasses.field(default_factory=list)
 
     @property
     def step(self) -> int:

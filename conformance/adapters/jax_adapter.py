@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from impl_jax import agent, behavior, distributions, layers, networks, optimizer, returns, rssm, transforms, world_model
+from impl_jax.learner import select_device
 from spec import Config, Spaces
 
 ROWS = (transforms, distributions, layers, rssm, networks, world_model, returns, behavior, optimizer, agent)
@@ -25,7 +26,7 @@ class JaxAdapter:
     def __init__(self, dtype: str, device: str | None) -> None:
         self.dtype = dtype
         self.exact = np.dtype("float64" if dtype == "float64" else "float32")
-        self.device = jax.devices("gpu" if device == "cuda" else device)[0] if device else jax.devices()[0]
+        self.device = select_device(device)
         self.compiled: dict[Any, Callable[..., Any]] = {}
 
     def __getattr__(self, name: str) -> Any:

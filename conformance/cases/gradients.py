@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from conformance.cases.agent import SAMPLING_MARGIN, WHOLE, bound_of, nudged
+from conformance.cases.agent import SAMPLING_MARGIN, WHOLE, bound_of
 from conformance.check import Run, check
-from conformance.problems import Problem, make_problem
+from conformance.problems import Problem, make_problem, with_sampling_margin
 from reference_numpy import agent
 from reference_numpy.transforms import exponential_bins, twohot
 from reference_numpy.world_model import continue_target
@@ -19,14 +19,14 @@ MASKED = ("rssm/posterior/out/bias", "rssm/prior/out/bias", "actor/out/buttons/l
 @functools.lru_cache(maxsize=8)
 def masked_problem(seed: int, profile: str, dtype: str) -> Problem:
     """No mixtures; one class of the first latent and one of an action have probability 0. No sample lies near a boundary."""
-    for attempt in range(100):
+
+    def draw(attempt: int) -> Problem:
         problem = make_problem(1000 * seed + attempt, profile, "vector", "mixed", dtype, latent_unimix=0.0, actor_unimix=0.0, free_nats=0.0)
         for name in MASKED:
             problem.state["params"][name][1] = -np.inf
-        totals = {agent.losses(*nudged(problem, shift).loss_arguments)[0] for shift in (-SAMPLING_MARGIN, SAMPLING_MARGIN)}
-        if len(totals) == 1 and np.isfinite(totals.pop()):
-            return problem
-    raise RuntimeError("no problem with a sampling margin was found")
+        return problem
+
+    return with_sampling_margin(draw, SAMPLING_MARGIN)
 
 
 @check(
@@ -71,12 +71,11 @@ def constant_outputs_have_the_gradients_of_the_chapter(run: Run) -> None:
 @functools.lru_cache(maxsize=8)
 def problem_without_epsilon(seed: int, profile: str, dtype: str) -> Problem:
     """All observations and actions, and norms that are exact up to 1e-12."""
-    for attempt in range(100):
-        problem = make_problem(1000 * seed + attempt, profile, "both", "mixed", dtype, norm_epsilon=1e-12)
-        totals = {agent.losses(*nudged(problem, shift).loss_arguments)[0] for shift in (-SAMPLING_MARGIN, SAMPLING_MARGIN)}
-        if len(totals) == 1:
-            return problem
-    raise RuntimeError("no problem with a sampling margin was found")
+
+    def draw(attempt: int) -> Problem:
+        return make_problem(1000 * seed + attempt, profile, "both", "mixed", dtype, norm_epsilon=1e-12)
+
+    return with_sampling_margin(draw, SAMPLING_MARGIN)
 
 
 @check("LAY-4", "LAY-8", uses=["loss_derivatives"], level=2, dtypes=WHOLE)

@@ -30,6 +30,11 @@ def expect_sums(run: Run, function: str, arguments: tuple[Any, ...], terms: int,
     run.expect(function, arguments, layer(*arguments), magnitude=magnitude, bound=bound)
 
 
+def is_double(actual: Any, expected: np.ndarray) -> bool:
+    """Whether somebody who was asked for bfloat16 computed in float64, as the reference always does."""
+    return np.shape(actual) == expected.shape and np.allclose(actual, expected, rtol=1e-9, atol=0)
+
+
 def pixels(height: int, width: int) -> np.ndarray:
     """[height, width, 1] with 10i + j at row i and column j."""
     return (10.0 * np.arange(height)[:, None] + np.arange(width))[..., None]
@@ -101,11 +106,11 @@ def results_have_the_compute_dtype(run: Run) -> None:
         ("dense", (params, "layer", x, 1e-4)),
     ):
         result = np.asarray(run.call(function, *arguments), np.float64)
-        double = np.allclose(result, getattr(reference, function)(*arguments), rtol=1e-9, atol=0)
+        double = is_double(result, getattr(reference, function)(*arguments))
         run.holds(f"{function} gives bfloat16 numbers", double or np.array_equal(result, round_to(result, "bfloat16")))
     # 1 + 2^-9 becomes 1: nothing is left of the difference.
     one = np.array([1.0])
-    in_double = np.allclose(run.call("silu", one), reference.silu(one), rtol=1e-12, atol=0)
+    in_double = is_double(run.call("silu", one), reference.silu(one))
     difference = run.call("linear", np.ones(2), np.array([[1 + 2.0**-9], [-1]]), np.zeros(1))
     run.exact("the kernel is rounded to bfloat16", difference, np.array([2.0**-9 if in_double else 0]))
 
@@ -129,15 +134,18 @@ def rms_norm_literals(run: Run) -> None:
 
 @check("LAY-1", "LAY-4", "LAY-16", uses=["rms_norm"], level=0)
 def rms_norm_matches(run: Run) -> None:
-    """Rows of several magnitudes and any leading axes, each on its own, images too; in bfloat16 with one rounding at the end."""
+    """Rows of several magnitudes and any leading axes, each on its own, images too; in bfloat16 the scale and the result are rounded."""
 
     @run.for_all(seed=seeds(), leading=LEADING, n=st.sampled_from([5, 64]), scale=st.sampled_from([1e-4, 1e-2, 1.0, 1e4]))
     def _(seed: int, leading: tuple[int, ...], n: int, scale: float) -> None:
         rng = np.random.default_rng(seed)
         x = run.cast(rng.normal(0.5, 1, (*leading, n)) * scale * 10 ** rng.uniform(-1, 1, (*leading, 1)))
-        arguments = (x, run.cast(rng.normal(1, 0.5, n)), 1e-4)
+        # A parameter: float32 beside bfloat16 inputs.
+        weight = round_to(rng.normal(1, 0.5, n), "float64" if run.dtype == "float64" else "float32")
+        actual = run.call("rms_norm", x, weight, 1e-4)
+        double = is_double(actual, reference.rms_norm(x, weight, 1e-4))
         bound = 0.51 * EPSILON["bfloat16"] if run.dtype == "bfloat16" else (n + 16) * run.u
-        run.expect("rms_norm", arguments, reference.rms_norm(*arguments), bound=bound)
+        run.compare("rms_norm", actual, reference.rms_norm(x, weight if double else run.cast(weight), 1e-4), bound=bound)
 
 
 @check("LAY-5", uses=["silu"], level=0)

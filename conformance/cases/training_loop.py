@@ -50,18 +50,36 @@ def train_steps_do_not_drift(run: Run) -> None:
 
 @check("LOOP-16", uses=["ReplayRatio"], level=0)
 def no_training_and_no_way_back(run: Run) -> None:
-    """A ratio of 0 never trains, not even at the first call; a step smaller than the one before is refused."""
+    """A ratio of 0 never trains, not even at the first call; a step smaller than the remembered one is refused with any ratio."""
     never = run.call("ReplayRatio", 0.0, 1024)
     run.exact("ratio 0", [never(step) for step in (0, 1, 2000, 10**7)], [0, 0, 0, 0])
     run.holds("ratio 0 remembers no step", never.state_dict()["step"] is None)
-    counter = run.call("ReplayRatio", 1.0, 4)
+    counter, resumed = run.call("ReplayRatio", 1.0, 4), run.call("ReplayRatio", 0.0, 4)
     counter(10)
-    try:
-        counter(9)
-    except ValueError as error:
-        run.holds("the error has a message", bool(str(error)))
-    else:
-        run.holds("step 9 after 10 is refused", False)
+    resumed.load_state_dict(counter.state_dict())
+    for ratio in (counter, resumed):
+        try:
+            ratio(9)
+        except ValueError as error:
+            run.holds("the error has a message", bool(str(error)))
+        else:
+            run.holds("step 9 after 10 is refused", False)
+
+
+@check("LOOP-16", "LOOP-23", uses=["ReplayRatio"], level=0)
+def a_pause_is_never_paid_for(run: Run) -> None:
+    """What was collected with ratio 0 gives no credit to the ratio that follows; the credit from before is kept."""
+    paying = run.call("ReplayRatio", 1.0, 1024)
+    paying(0), paying(1000)
+    paused = run.call("ReplayRatio", 0.0, 1024)
+    paused.load_state_dict(json.loads(json.dumps(paying.state_dict())))
+    run.exact("the pause", [paused(step) for step in (1000, 5000, 200_000)], [0, 0, 0])
+    run.holds(f"{paused.state_dict()} is step 200000, credit 1000", dict(paused.state_dict()) == {"step": 200_000, "credit": "1000"})
+    paying.load_state_dict(json.loads(json.dumps(paused.state_dict())))
+    run.exact("after it", [paying(step) for step in (200_000, 200_023, 200_024, 201_047, 201_048)], [0, 0, 1, 0, 1])
+    large = run.call("ReplayRatio", 0.0, 4)
+    large.load_state_dict({"step": 10, "credit": "7"})
+    run.exact("a credit saved with larger batches", large(20), 0)
 
 
 @check("LOOP-21", "LOOP-23", uses=["ReplayRatio"], level=0)

@@ -15,6 +15,8 @@ from train.errors import UserError
 
 Observation = dict[str, np.ndarray]
 
+FLOAT32_MAX = float(np.finfo(np.float32).max)
+
 
 class ContractEnv(gymnasium.Env[Observation, np.ndarray]):
     """Wraps an environment: observations become arrays of `spec.Spaces`, flat actions become the environment's, actions are repeated.
@@ -47,11 +49,10 @@ class ContractEnv(gymnasium.Env[Observation, np.ndarray]):
         return self._observation(value[0]), {}
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        env_action = self._translation.action(action)
         total = 0.0
         for _ in range(self._action_repeat):
             self._steps += 1
-            value = self._call(self._env.step, env_action)
+            value = self._call(self._env.step, self._translation.action(action))  # Made anew: an environment may write into it.
             if not isinstance(value, tuple) or len(value) != 5:
                 raise self._error(
                     f"step returned {_describe(value)}; Gymnasium's step returns (observation, reward, terminated, truncated, info)"
@@ -60,6 +61,8 @@ class ContractEnv(gymnasium.Env[Observation, np.ndarray]):
             total += self._reward(reward)
             if terminated or truncated:
                 break
+        if abs(total) > FLOAT32_MAX:
+            raise self._error(f"the rewards of {self._action_repeat} repeated actions add up to {total}, more than float32 can hold")
         return self._observation(observation), total, bool(terminated), bool(truncated), {}
 
     def close(self) -> None:
@@ -76,7 +79,7 @@ class ContractEnv(gymnasium.Env[Observation, np.ndarray]):
         if array.size != 1 or array.dtype.kind not in "fiub":
             raise self._error(f"the reward is {_describe(value)}; expected one number")
         reward = float(array.reshape(()))
-        if not math.isfinite(reward) or abs(reward) > np.finfo(np.float32).max:
+        if not math.isfinite(reward) or abs(reward) > FLOAT32_MAX:
             raise self._error(f"the reward is {reward}; expected a finite number")
         return reward
 

@@ -22,8 +22,6 @@ from PIL import Image as Pillow
 from spec import Discrete, Image, Spaces, Vector
 from train.errors import UserError
 
-IMAGE_CHANNELS = (1, 3, 4)
-
 Path = tuple[str, ...]
 
 
@@ -114,7 +112,7 @@ def _observation_target(key: str, space: gym.Space[Any], image_size: int) -> Vec
     if isinstance(space, gym.Box):
         if _is_image(space):
             return Image(image_size, image_size, space.shape[2] if len(space.shape) == 3 else 1)
-        if space.dtype == np.uint8 and len(space.shape) == 3 and space.shape[0] in IMAGE_CHANNELS:
+        if space.dtype == np.uint8 and len(space.shape) == 3 and space.shape[0] < min(space.shape[1:]):
             raise _unsupported(
                 "observation", key, space, "this looks like an image with channels first; give it as height, width, channels"
             )
@@ -138,7 +136,8 @@ def _unsupported(kind: str, key: str, space: gym.Space[Any], remedy: str) -> Use
 
 
 def _is_image(space: gym.Box) -> bool:
-    return space.dtype == np.uint8 and (len(space.shape) == 2 or (len(space.shape) == 3 and space.shape[2] in IMAGE_CHANNELS))
+    """A uint8 box [H, W], or [H, W, C] with fewer channels than rows and columns: colours, or several frames."""
+    return space.dtype == np.uint8 and (len(space.shape) == 2 or (len(space.shape) == 3 and space.shape[2] <= min(space.shape[:2])))
 
 
 def _classes(space: gym.Space[Any]) -> tuple[int, ...] | None:

@@ -40,6 +40,7 @@ class Environments:
     def __init__(self, make: Callable[[int], ContractEnv], count: int, processes: bool) -> None:
         self.count = count
         self._action: np.ndarray | None = None
+        self._pending = False  # whether worker processes owe an answer, or failed to give one
         self._is_last = np.zeros(self.count, bool)
         makers = [functools.partial(_make_in_worker, make, index) for index in range(self.count)]
         self._guard = _worker_errors if processes else nullcontext
@@ -53,14 +54,17 @@ class Environments:
 
     def reset(self, seeds: list[int]) -> Record:
         """The first records of new episodes, [N, ...] each."""
+        self._pending = True
         with self._guard():
             observation, _ = self._envs.reset(seed=list(seeds))
+        self._pending = False
         nothing = np.zeros(self.count, bool)
         self._is_last = nothing
         return self._record(observation, np.zeros(self.count), np.ones(self.count, bool), nothing, nothing)
 
     def start(self, action: np.ndarray) -> None:
         """Sends flat actions [N, A]; where the last record was the last of an episode, the action is ignored."""
+        self._pending = True
         with self._guard():
             if isinstance(self._envs, AsyncVectorEnv):
                 self._envs.step_async(action)
@@ -74,6 +78,7 @@ class Environments:
                 observation, reward, terminated, truncated, _ = self._envs.step_wait()
             else:
                 observation, reward, terminated, truncated, _ = self._envs.step(self._action)
+        self._pending = False
         is_first = self._is_last
         self._is_last = terminated | truncated
         return self._record(observation, reward, is_first, self._is_last, terminated)
@@ -84,10 +89,17 @@ class Environments:
         return self.finish()
 
     def close(self) -> None:
-        try:
+        if isinstance(self._envs, AsyncVectorEnv) and self._pending:
+            # Gymnasium would wait for answers that have been read already, or that a worker which is gone will never give.
+            for process in self._envs.processes:
+                process.kill()
+                process.join()
+            for pipe in self._envs.parent_pipes:
+                if pipe is not None:
+                    pipe.close()
+            self._envs.closed = True
+        else:
             self._envs.close()
-        except (EOFError, OSError):  # A worker is gone; end the others.
-            self._envs.close(terminate=True)
 
     def _record(self, observation: Any, reward: np.ndarray, *flags: np.ndarray) -> Record:
         """Everything in memory of its own: the vector environments keep and reuse their arrays."""
@@ -114,7 +126,8 @@ def is_slow(make: Callable[[int], ContractEnv], seed: int) -> bool:
 
 def _make_in_worker(make: Callable[[int], ContractEnv], index: int) -> ContractEnv:
     if multiprocessing.parent_process() is not None:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the trainer, which then closes its environments.
+        for number in (signal.SIGINT, signal.SIGTERM):  # Sent to the whole group, they are for the trainer, which then closes its workers.
+            signal.signal(number, signal.SIG_IGN)
     return make(index)
 
 

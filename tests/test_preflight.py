@@ -1,0 +1,96 @@
+"""Preflight refuses backends that are nearly right, and only them."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from conformance import preflight as module
+from conformance.adapter import load_adapter
+from conformance.mutants import Mutant, MutantAdapter
+from conformance.preflight import preflight, preflight_adapter
+from conformance.problems import Problem, make_problem, with_sampling_margin
+from reference_numpy import layers
+from spec import Config, Discrete, Image, Spaces, Vector, load_config
+
+SPACES = Spaces({"position": Vector(3), "image": Image(16, 16, 1)}, {"move": Vector(2), "button": Discrete((3,))})
+
+
+def config(dtype: str) -> Config:
+    return load_config("paper", "tiny", compute_dtype=dtype)
+
+
+class ChangedGradients:
+    """The PyTorch backend, but for its gradients."""
+
+    def __init__(self, dtype: str, change: Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]]) -> None:
+        self._right = load_adapter("torch", dtype)
+        self._change = change
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._right, name)
+
+    def gradients(self, *arguments: Any) -> dict[str, np.ndarray]:
+        return self._change(self._right.gradients(*arguments))  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32", "bfloat16"])
+def test_a_right_backend_passes(dtype: str) -> None:
+    report = preflight("torch", SPACES, config(dtype), "cpu")
+    assert report.passed, report.summary
+    assert preflight("numpy", SPACES, config(dtype)).passed
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize(
+    "start", ["critic/", "actor/hidden0/kernel", "rssm/gru/bias", "encoder/image/conv0/kernel", "reward/out/bias", "continue/hidden0/scale"]
+)
+def test_a_gradient_that_is_missing_is_seen(start: str, dtype: str) -> None:
+    def without(gradients: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        assert any(name.startswith(start) for name in gradients)
+        return {name: value * (not name.startswith(start)) for name, value in gradients.items()}
+
+    report = preflight_adapter(ChangedGradients(dtype, without), SPACES, config(dtype))
+    assert not report.passed
+    assert "gradient along" in report.summary
+
+
+def test_a_gradient_that_is_not_finite_is_seen() -> None:
+    def spoiled(gradients: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        return {name: np.full_like(value, np.nan) if name == "continue/out/bias" else value for name, value in gradients.items()}
+
+    assert not preflight_adapter(ChangedGradients("float64", spoiled), SPACES, config("float64")).passed
+
+
+def tf32(x: Any) -> np.ndarray:
+    """x rounded to the ten bits after the point that tensor cores read of a float32 number."""
+    bits = np.asarray(x, np.float32).view(np.uint32).astype(np.uint64) + 0x1000
+    return (bits & 0xFFFFE000).astype(np.uint32).view(np.float32).astype(np.float64)
+
+
+LINEAR, CONVOLUTION = layers.linear, layers.convolution
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong"),
+    [
+        ("linear", lambda x, kernel, bias: LINEAR(tf32(x), tf32(kernel), bias)),
+        ("convolution", lambda x, kernel, bias, stride: CONVOLUTION(tf32(x), tf32(kernel), bias, stride)),
+    ],
+)
+def test_tf32_is_not_float32(name: str, wrong: Callable[..., Any]) -> None:
+    adapter = MutantAdapter(Mutant("tf32", "operands are rounded to TF32", {f"layers.{name}": wrong}))
+    report = preflight_adapter(adapter, SPACES, config("float32"))
+    assert not report.passed
+    assert report.worst > 3 * module.NETWORK_BOUND["float32"]
+
+
+def test_a_problem_without_a_margin_is_not_taken() -> None:
+    def draw(attempt: int) -> Problem:
+        problem = make_problem(0, "paper", "vector", "discrete")
+        problem.noise["posterior"][:] = 0.0  # the boundary of the first class
+        return problem
+
+    with pytest.raises(RuntimeError, match=r"none of 3 problems keeps every sample 0\.5 away"):
+        with_sampling_margin(draw, 0.5, attempts=3)
