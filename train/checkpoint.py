@@ -2,8 +2,8 @@
 
 LOGDIR/checkpoints/<environment step>/
   learner.safetensors   the training state under its canonical names (spec/10-agent.md): either backend reads it
-  replay.safetensors    the replay buffer (spec/11-replay.md)
-  run.json              configuration, spaces, counters: [LOOP-21]
+  drawn.safetensors     the batch that was drawn ahead
+  run.json              configuration, spaces, counters, and which state of LOGDIR/replay belongs to it: [LOOP-21]
 """
 
 import dataclasses
@@ -21,7 +21,7 @@ from safetensors.numpy import load_file, save_file
 
 from train.errors import UserError
 
-FORMAT = 1
+FORMAT = 2
 OURS = re.compile(r"\d{12}(\.tmp|\.old)?")  # .tmp: being written; .old: about to be replaced by the same step
 
 Arrays = dict[str, np.ndarray]
@@ -39,28 +39,33 @@ class Checkpoint:
         return _read_arrays(self.path / "learner.safetensors")
 
     @property
-    def replay(self) -> Arrays:
-        return _read_arrays(self.path / "replay.safetensors")
+    def drawn(self) -> Arrays:
+        return _read_arrays(self.path / "drawn.safetensors")
 
 
-def save(logdir: Path, step: int, learner: Mapping[str, Any], replay: Mapping[str, Any], info: Mapping[str, Any]) -> Path:
+def name_of(step: int) -> str:
+    """The name of the checkpoint of an environment step."""
+    return f"{step:012d}"
+
+
+def save(logdir: Path, step: int, learner: Mapping[str, Any], drawn: Mapping[str, Any], info: Mapping[str, Any]) -> Path:
     """Writes a checkpoint under another name, renames it, then removes the older ones. [LOOP-22]
 
     Raises:
       UserError: the disk refuses it.
     """
     directory = logdir / "checkpoints"
-    final, temporary = directory / f"{step:012d}", directory / f"{step:012d}.tmp"
+    final, temporary = directory / name_of(step), directory / f"{name_of(step)}.tmp"
     try:
         shutil.rmtree(temporary, ignore_errors=True)
         temporary.mkdir(parents=True)
         save_file(_contiguous(_single_precision(learner)), temporary / "learner.safetensors")
-        save_file(_contiguous(replay), temporary / "replay.safetensors")
+        save_file(_contiguous(drawn), temporary / "drawn.safetensors")
         (temporary / "run.json").write_text(json.dumps({"format": FORMAT, **info}, indent=2) + "\n", encoding="utf-8")
         for file in temporary.iterdir():
             _flush_to_disk(file)
         if final.exists():  # The same step again, as before and after the last evaluation.
-            final.rename(directory / f"{step:012d}.old")
+            final.rename(directory / f"{name_of(step)}.old")
         temporary.rename(final)
         for other in directory.iterdir():
             if other != final and OURS.fullmatch(other.name):

@@ -1,6 +1,7 @@
 """The command `train`: options in, a run out, and one line for every mistake that the user can mend."""
 
 import argparse
+import math
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -8,7 +9,7 @@ from typing import Any, NoReturn
 
 from spec import hyperparameters, profiles, sizes
 from train.errors import UserError
-from train.options import DEFAULT_PRESET, PROCESSES, RESUME, Options, make_options, presets
+from train.options import DEFAULT_PRESET, DETER_DTYPES, PROCESSES, RESUME, Options, make_options, presets
 
 DESCRIPTION = """Train a DreamerV3 agent.
 
@@ -101,6 +102,10 @@ def build_parser() -> argparse.ArgumentParser:
     envs.add_argument("--image-size", type=_whole(1), metavar="N", help="side to which images are resized, in pixels (default 64)")
     envs.add_argument("--processes", choices=PROCESSES, help="one process per environment; auto: if its steps are slow (default)")
 
+    replay = parser.add_argument_group("replay")
+    replay.add_argument("--replay-memory", type=_positive, metavar="GIB", help="memory that maps the files of the buffer (default 2)")
+    replay.add_argument("--replay-deter", choices=DETER_DTYPES, help="precision of the latents in the buffer (default bfloat16)")
+
     schedule = parser.add_argument_group("schedule")
     schedule.add_argument(
         "--eval-every",
@@ -187,6 +192,13 @@ def _seconds(text: str) -> float:
     value = _real(text)
     if not value >= 0:
         raise argparse.ArgumentTypeError(f"{text!r} is not a time in seconds")
+    return value
+
+
+def _positive(text: str) -> float:
+    value = _real(text)
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0")
     return value
 
 

@@ -12,7 +12,7 @@ from reference_numpy.training_loop import can_train, derive_seed
 from train.backend import Learner
 from train.envs import Record
 from train.options import Options
-from train.schedule import Schedule, finish, finite_action, log_episode, save, write_back
+from train.schedule import Schedule, finish, finite_action, log_episode, save
 from train.setup import prepare
 from train.state import Run
 
@@ -65,9 +65,9 @@ def train(run: Run) -> bool:
 def remember_and_learn(run: Run, record: Record, action: np.ndarray, latents: Mapping[str, np.ndarray]) -> None:
     """Adds the workers' records one by one, and after each one trains as often as the replay ratio says: [LOOP-4]."""
     action = np.where(record["is_last"][:, None], np.float32(0), action)  # [LOOP-9]: nothing can be done at an end.
-    batched = {**record, "action": action, **latents}
+    packed = run.replay.pack({**record, "action": action, **latents})
     for worker in range(run.envs.count):
-        run.replay.add({key: value[worker] for key, value in batched.items()}, worker)
+        run.replay.add_packed(packed, worker, worker)
         run.counters.records += 1
         if can_train(len(run.replay), run.options.config):
             for _ in range(run.ratio(run.counters.records)):
@@ -75,16 +75,13 @@ def remember_and_learn(run: Run, record: Record, action: np.ndarray, latents: Ma
 
 
 def learn(run: Run) -> None:
-    """One train step. Its latents are written back before the next draw: until then it may still be computing."""
-    write_back(run)
-    seeds = {purpose: derive_seed(run.options.seed, purpose, run.counters.train_steps) for purpose in ("replay", "train")}
-    rng = np.random.Generator(np.random.PCG64(seeds["replay"]))
-    batch = dict(run.replay.sample(rng.random(run.options.config.batch_size)))
+    """One train step. The next batch is drawn meanwhile, and the latents are written back when they are computed: [LOOP-17]."""
+    batch = run.replay.take()
     ids = batch.pop("ids")
-    metrics, latents = run.learner.train_step(batch, seeds["train"])
+    metrics, latents = run.learner.train_step(batch, derive_seed(run.options.seed, "train", run.counters.train_steps))
+    run.replay.write_back(ids, latents)
     run.counters.train_steps += 1
     run.metrics.append(metrics)
-    run.pending = (ids, latents)
 
 
 class Scores:

@@ -15,13 +15,15 @@ from train.errors import UserError
 DEFAULT_PRESET = "cartpole"
 RESUME = ("auto", "never", "must")
 PROCESSES = ("auto", "yes", "no")
+DETER_DTYPES = ("bfloat16", "float32")
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
     """Everything that a run depends on, beside the code.
 
-    steps and eval_every are environment steps: records times action_repeat. checkpoint_every and log_every are seconds.
+    steps and eval_every are environment steps: records times action_repeat. checkpoint_every and log_every are seconds. replay_memory is
+    in GiB.
     """
 
     backend: str
@@ -40,11 +42,13 @@ class Options:
     log_every: float = 5.0
     resume: str = "auto"
     processes: str = "auto"
+    replay_memory: float = 2.0
+    replay_deter: str = "bfloat16"
     preflight: bool = True
 
     def identity(self) -> dict[str, Any]:
         """What a checkpoint must agree in to be continued. The backend is not in it: either continues what the other began."""
-        run = {name: getattr(self, name) for name in ("task", "seed", "action_repeat", "image_size")}
+        run = {name: getattr(self, name) for name in ("task", "seed", "action_repeat", "image_size", "replay_deter")}
         config = {name: list(value) if isinstance(value, tuple) else value for name, value in dataclasses.asdict(self.config).items()}
         return run | config
 

@@ -133,23 +133,16 @@ def run_evaluation(run: Run) -> None:
     run.logger.write(run.step, counters.seconds, {f"evaluation/{name}": value for name, value in metrics.items()})
 
 
-def write_back(run: Run) -> None:
-    """Hands the latents of the last train step to the replay buffer: [LOOP-17]."""
-    if run.pending:
-        ids, latents = run.pending
-        run.replay.write_back(ids, {name: np.asarray(value) for name, value in latents.items()})
-        run.pending = None
-
-
 def save(run: Run) -> Path:
     """Writes a checkpoint: [LOOP-21].
 
     Raises:
       UserError: the disk refuses it, or the run has diverged (then the checkpoint before stays).
     """
-    write_back(run)
     for metrics in run.metrics[-1:]:
         _require_finite(run, {name: float(value) for name, value in metrics.items()})
+    name = checkpoint.name_of(run.step)
+    description, drawn = run.replay.save(name)
     info = {
         "identity": run.options.identity(),
         "spaces": run.envs.spaces.to_json(),
@@ -158,8 +151,11 @@ def save(run: Run) -> Path:
         "replay_ratio": run.ratio.state_dict(),
         "random_return": run.random_return,
         "evaluation": run.evaluation,
+        "replay": description,
     }
-    return checkpoint.save(run.options.logdir, run.step, run.learner.state_dict(), run.replay.state_dict(), info)
+    path = checkpoint.save(run.options.logdir, run.step, run.learner.state_dict(), drawn, info)
+    run.replay.replay.keep([name])
+    return path
 
 
 def finish(run: Run) -> None:

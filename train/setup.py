@@ -3,10 +3,10 @@
 import functools
 import math
 from contextlib import ExitStack, closing
+from typing import Any
 
 import numpy as np
 
-from reference_numpy.replay import Replay
 from reference_numpy.training_loop import ReplayRatio, derive_seed
 from spec import Spaces, parameter_table
 from train import checkpoint
@@ -17,6 +17,7 @@ from train.errors import UserError
 from train.evaluation import play_randomly
 from train.logger import Display, Logger
 from train.options import Options
+from train.replay import Prefetcher, Replay, erase
 from train.state import Counters, Run
 
 
@@ -42,7 +43,7 @@ def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -
         envs=envs,
         test_envs=test_envs,
         learner=agent,
-        replay=Replay(options.config.replay_capacity, options.config.batch_length),
+        replay=stack.enter_context(closing(_make_replay(options, saved, display))),
         ratio=ReplayRatio(options.config.replay_ratio, options.config.batch_size * options.config.batch_length),
         logger=stack.enter_context(closing(Logger(options.logdir, step))),
         display=display,
@@ -141,12 +142,37 @@ def _make_learner(learner: type[Learner], options: Options, spaces: Spaces) -> L
         raise UserError(f"the backend {options.backend} does not run with --device {options.device}: {error}") from error
 
 
+def _make_replay(options: Options, saved: Checkpoint | None, display: Display) -> Prefetcher:
+    """The buffer in LOGDIR/replay: that of the checkpoint, or an empty one."""
+    config, directory = options.config, options.logdir / "replay"
+    settings: dict[str, Any] = {
+        "memory_limit": int(options.replay_memory * 2**30),
+        "deter_dtype": options.replay_deter,
+        "classes": config.classes,
+    }
+    if saved:
+        try:
+            replay = Replay.restore(directory, saved.info["replay"], config.replay_capacity, config.batch_length, **settings)
+        except ValueError as error:
+            raise UserError(f"the replay buffer of the checkpoint {saved.path} cannot be restored: {error}") from error
+        for line in replay.warnings:
+            display.say(f"replay: {line}")
+    else:
+        erase(directory)
+        replay = Replay(config.replay_capacity, config.batch_length, directory, **settings)
+
+    def uniform(train_step: int) -> np.ndarray:
+        return np.random.Generator(np.random.PCG64(derive_seed(options.seed, "replay", train_step))).random(config.batch_size)
+
+    return Prefetcher(replay, uniform, saved.info["counters"]["train_steps"] if saved else 0)
+
+
 def _restore(run: Run, saved: Checkpoint) -> None:
     """Continues where the checkpoint stopped: [LOOP-23]."""
     info = saved.info
     try:
         run.learner.load_state_dict(saved.learner)
-        run.replay.load_state_dict(saved.replay)
+        run.replay.load_drawn(saved.drawn)
     except ValueError as error:
         raise UserError(f"the checkpoint {saved.path} does not fit this version: {error}") from error
     run.ratio.load_state_dict(info["replay_ratio"])

@@ -5,14 +5,12 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
-from reference_numpy.replay import Replay
 from reference_numpy.training_loop import ReplayRatio
 from train.backend import Learner
 from train.envs import Environments
 from train.logger import Display, Logger
 from train.options import Options
+from train.replay import Prefetcher
 
 
 @dataclasses.dataclass
@@ -33,7 +31,7 @@ class Counters:
 class Run:
     """Everything that a run is made of.
 
-    pending: ids and latents of the last train step, not written back yet. metrics: of the train steps since the last line of metrics.
+    metrics: of the train steps since the last line of metrics.
     interrupted: the signals that asked the run to end.
     """
 
@@ -41,7 +39,7 @@ class Run:
     envs: Environments
     test_envs: Environments | None
     learner: Learner
-    replay: Replay
+    replay: Prefetcher
     ratio: ReplayRatio
     logger: Logger
     display: Display
@@ -49,7 +47,6 @@ class Run:
     random_return: float | None = None
     evaluation: dict[str, float] | None = None  # of the last evaluation: step, return
     returns: collections.deque[float] = dataclasses.field(default_factory=lambda: collections.deque(maxlen=20))  # of the last episodes
-    pending: tuple[np.ndarray, Mapping[str, Any]] | None = None
     metrics: list[Mapping[str, Any]] = dataclasses.field(default_factory=list)
     interrupted: list[int] = dataclasses.field(default_factory=list)
 
