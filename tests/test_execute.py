@@ -40,7 +40,8 @@ def test_a_right_and_a_wrong_function() -> None:
     check = CHECKS["transforms.symlog_matches"]
     right = run_check(check, adapter(symlog=lambda x: np.sign(x) * np.log1p(np.abs(x))), "float64", "paper")
     assert right.status == "pass", right.message
-    wrong = run_check(check, adapter(symlog=lambda x: np.sign(x) * np.log(np.abs(x))), "float64", "paper")
+    with np.errstate(all="ignore"):
+        wrong = run_check(check, adapter(symlog=lambda x: np.sign(x) * np.log(np.abs(x))), "float64", "paper")
     assert (wrong.status, "symlog" in wrong.message) == ("fail", True)
 
 
