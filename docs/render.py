@@ -98,7 +98,7 @@ def conformance_summary() -> str:
 
 
 def conformance_chapters() -> str:
-    """For each chapter the requirements that passed in float64, and the worst relative deviation."""
+    """For each chapter the requirements that passed in float64, and the worst deviation as a share of the allowed one."""
     runs = {key: report for key, report in conformance_runs().items() if key[1] == "float64"}
     prefixes = list(dict.fromkeys(name.split("-")[0] for report in runs.values() for name in report["requirements"]))
 
@@ -108,8 +108,8 @@ def conformance_chapters() -> str:
         if not offered:
             return "not offered"
         passed = sum(entry["status"] == "pass" for entry in offered)
-        worst = max(math.inf if entry["deviation"] is None else entry["deviation"] for entry in offered)
-        return f"{passed} of {len(offered)}, {worst:.0e}"
+        worst = max(math.inf if entry["share"] is None else entry["share"] for entry in offered)
+        return f"{passed} of {len(offered)}, {worst:.0%}"
 
     rows = [[prefix, *(cell(report, prefix) for report in runs.values())] for prefix in prefixes]
     return markdown_table(["requirements", *(f"{backend}, {profile}" for backend, _, profile in runs)], rows)
