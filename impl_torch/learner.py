@@ -19,7 +19,7 @@ from spec import Config, Discrete, Spaces, parameter_table
 Arrays = Mapping[str, np.ndarray]
 
 # Up to this many recurrent units one thread is as fast as several on a quiet machine, and many times as fast on a busy one, where each of
-# the thousands of small operations of a step would wait for the slowest thread.
+# the thousands of small operations of a step would wait for the slowest thread. Convolutions have enough work for all.
 SMALL = 256
 _THREADS = torch.get_num_threads()  # as the process came
 
@@ -39,7 +39,7 @@ class Learner:
         self.device = str(self._device)
         if self._device.type == "cpu" and "OMP_NUM_THREADS" not in os.environ:
             # The count holds for the whole process: a larger model made after a small one must not stay on its one thread.
-            torch.set_num_threads(1 if config.deter <= SMALL else _THREADS)
+            torch.set_num_threads(1 if config.deter <= SMALL and not spaces.images else _THREADS)
         if self._device.type == "cuda":
             # [LAY-1]: TensorFloat-32 is not float32. Convolutions would use it unasked.
             torch.set_float32_matmul_precision("highest")
