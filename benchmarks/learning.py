@@ -20,7 +20,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, FormatStrFormatter
 
-from benchmarks.machine import describe
+from benchmarks.machine import command, describe
 from train.curve import BLUE, GRAY, ORANGE
 from train.logger import read_metrics
 
@@ -35,18 +35,18 @@ def train(backend: str, seed: int, logdir: Path, arguments: list[str]) -> None:
     Raises:
       RuntimeError: the run failed.
     """
-    command = [sys.executable, "-m", "train", "--backend", backend, "--seed", str(seed), "--logdir", str(logdir), *arguments]
+    run = [sys.executable, "-m", "train", "--backend", backend, "--seed", str(seed), "--logdir", str(logdir), *arguments]
     made = logdir / "made.json"
     if (logdir / "curve.png").exists() and made.exists() and json.loads(made.read_text(encoding="utf-8"))["arguments"] == arguments:
         return
     logdir.mkdir(parents=True, exist_ok=True)
     made.write_text(json.dumps({"arguments": arguments, "machine": describe()}), encoding="utf-8")
     with open(logdir / "output.log", "w", encoding="utf-8") as log:
-        result = subprocess.run(command, stdout=log, stderr=log, check=False)
+        result = subprocess.run(run, stdout=log, stderr=log, check=False)
     last = (logdir / "output.log").read_text(encoding="utf-8").strip().splitlines()[-1:]
     print(f"{backend} seed {seed}: {' '.join(last)}", flush=True)
     if result.returncode:
-        raise RuntimeError(f"{' '.join(command)}: exit code {result.returncode}; see {logdir / 'output.log'}")
+        raise RuntimeError(f"{' '.join(run)}: exit code {result.returncode}; see {logdir / 'output.log'}")
 
 
 def points(logdir: Path, metrics: list[str]) -> dict[str, Any]:
@@ -153,8 +153,7 @@ def main() -> int:
         list(pool.map(lambda case: train(*case, arguments), cases))
     runs = [{"backend": backend, "seed": seed, **points(logdir, options.metrics)} for backend, seed, logdir in cases]
     options.out.parent.mkdir(parents=True, exist_ok=True)
-    command = "python -m benchmarks.learning " + " ".join(sys.argv[1:])
-    report = {"command": command, "cores_per_run": len(shares[0]), "runs": runs}
+    report = {"command": command("benchmarks.learning"), "cores_per_run": len(shares[0]), "runs": runs}
     options.out.with_suffix(".json").write_text(json.dumps(report) + "\n", encoding="utf-8")
     draw(options.out.with_suffix(".png"), options.title, runs, options.metrics)
     for run in runs:

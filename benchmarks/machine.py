@@ -3,7 +3,9 @@
 import importlib.metadata
 import os
 import platform
+import shlex
 import subprocess
+import sys
 import time
 
 import numpy as np
@@ -20,6 +22,11 @@ def describe() -> dict[str, object]:
         "commit": _commit(),
         "date": time.strftime("%Y-%m-%d"),
     }
+
+
+def command(module: str) -> str:
+    """The command line that is running, as one would type it in the root of the repository."""
+    return f"python -m {module} {shlex.join(sys.argv[1:])}"
 
 
 def matrix_rate(size: int = 2048, repeats: int = 5) -> float:

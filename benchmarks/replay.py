@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.machine import describe
+from benchmarks.machine import command, describe
 from train.replay import Replay
 
 WORKERS, ROWS, LENGTH = 16, 16, 64
@@ -127,9 +127,9 @@ def timed(function: Any) -> float:
 def run_case(kind: str, filled: int, options: argparse.Namespace, limit: int) -> dict[str, Any]:
     """One case in a process of its own."""
     with tempfile.TemporaryDirectory(prefix="replay-", dir=options.directory) as directory:
-        command = [sys.executable, "-m", "benchmarks.replay", "--case", kind, "--records", str(filled), "--directory", directory]
+        call = [sys.executable, "-m", "benchmarks.replay", "--case", kind, "--records", str(filled), "--directory", directory]
         settings = ["--seconds", str(options.seconds), "--limits", str(limit >> 20)]
-        result = subprocess.run([*command, *settings], capture_output=True, text=True, check=False)
+        result = subprocess.run([*call, *settings], capture_output=True, text=True, check=False)
     if result.returncode:
         return {"kind": kind, "records": filled, "error": result.stderr.strip().splitlines()[-1]}
     return json.loads(result.stdout.splitlines()[-1])
@@ -181,7 +181,9 @@ def main() -> int:
                     "".join(f"{results[-1].get(name, '-')!s:>{width}}" for name, width in COLUMNS), results[-1].get("error", ""), flush=True
                 )
     if options.out:
-        options.out.write_text(json.dumps({"command": " ".join(sys.argv), "machine": machine, "results": results}, indent=1) + "\n")
+        options.out.write_text(
+            json.dumps({"command": command("benchmarks.replay"), "machine": machine, "results": results}, indent=1) + "\n"
+        )
     return 1 if any("error" in result for result in results) else 0
 
 

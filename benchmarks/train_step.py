@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.machine import describe, matrix_rate
+from benchmarks.machine import command, describe, matrix_rate
 from spec import Config, Image, Spaces, Vector, load_config
 from train.backend import learner_class
 
@@ -133,7 +133,9 @@ def main() -> int:
                     results.append({"backend": backend, "size": size, "observation": observation, "dtype": dtype} | result)
                     print_row(results[-1])
     if options.out:
-        options.out.write_text(json.dumps({"command": " ".join(sys.argv), "machine": machine, "results": results}, indent=1) + "\n")
+        options.out.write_text(
+            json.dumps({"command": command("benchmarks.train_step"), "machine": machine, "results": results}, indent=1) + "\n"
+        )
     return 1 if any("error" in result for result in results) else 0
 
 

@@ -9,7 +9,8 @@ from typing import Any, NoReturn
 
 from spec import hyperparameters, profiles, sizes
 from train.errors import UserError
-from train.options import DEFAULT_PRESET, DETER_DTYPES, PROCESSES, RESUME, Options, make_options, presets
+from train.options import DEFAULT_PRESET, PROCESSES, RESUME, Options, make_options, presets
+from train.replay.layout import DETER_DTYPES
 
 DESCRIPTION = """Train a DreamerV3 agent.
 

@@ -15,7 +15,6 @@ from train.errors import UserError
 DEFAULT_PRESET = "cartpole"
 RESUME = ("auto", "never", "must")
 PROCESSES = ("auto", "yes", "no")
-DETER_DTYPES = ("bfloat16", "float32")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -39,6 +39,7 @@ class Replay:
       chunk_records: records of a chunk file, a multiple of `block_records`. None: as many as 16 MiB hold, at most 16384 and at most a
         sixty-fourth of the capacity, at least a block.
       block_records: records of a stream that are gathered in memory and written at once.
+      restoring: the directory may hold a buffer; for `restore`, which then reads it.
 
     Raises:
       ValueError: an argument out of range, or a directory that is in use.
@@ -56,31 +57,7 @@ class Replay:
         classes: int = 256,
         chunk_records: int | None = None,
         block_records: int = BLOCK_RECORDS,
-    ) -> None:
-        self._configure(
-            capacity,
-            length,
-            directory,
-            memory_limit=memory_limit,
-            deter_dtype=deter_dtype,
-            classes=classes,
-            chunk_records=chunk_records,
-            block_records=block_records,
-        )
-        if buffer_files(self.directory):
-            raise ValueError(f"{self.directory} holds a replay buffer already: restore it, or erase it first")
-
-    def _configure(
-        self,
-        capacity: int,
-        length: int,
-        directory: Path | None = None,
-        *,
-        memory_limit: int = MEMORY_LIMIT,
-        deter_dtype: str = "bfloat16",
-        classes: int = 256,
-        chunk_records: int | None = None,
-        block_records: int = BLOCK_RECORDS,
+        restoring: bool = False,
     ) -> None:
         if capacity < 1 or length < 1:
             raise ValueError(f"capacity and length must be at least 1, got {capacity} and {length}")
@@ -94,6 +71,8 @@ class Replay:
             weakref.finalize(self, shutil.rmtree, directory, ignore_errors=True)
         with disk_errors(directory):
             directory.mkdir(parents=True, exist_ok=True)
+        if buffer_files(directory) and not restoring:
+            raise ValueError(f"{directory} holds a replay buffer already: restore it, or erase it first")
         self.directory = directory
         self.lock = threading.RLock()
         self.warnings: list[str] = []
@@ -315,8 +294,7 @@ class Replay:
           ValueError: not a description, its file is damaged or missing, or the settings differ from those of the saved buffer.
           UserError: the disk refuses it.
         """
-        replay = cls.__new__(cls)
-        replay._configure(capacity, length, directory, **settings)
+        replay = cls(capacity, length, directory, restoring=True, **settings)
         recovery.restore(replay, description, continue_streams)
         return replay
 
