@@ -1,6 +1,7 @@
 """The command `train`: options in, a run out, and one line for every mistake that the user can mend."""
 
 import argparse
+import importlib
 import math
 import sys
 from collections.abc import Callable, Sequence
@@ -8,6 +9,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from spec import hyperparameters, profiles, sizes
+from train.commands import COMMANDS
 from train.errors import UserError
 from train.options import DEFAULT_PRESET, PROCESSES, RESUME, Options, make_options, presets
 from train.replay.layout import DETER_DTYPES
@@ -33,8 +35,12 @@ GROUPS = {
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command. Returns the exit code: 0, or 2 after a UserError, or 130 after Ctrl-C."""
+    arguments = sys.argv[1:] if arguments is None else arguments
     try:
-        options = parse(sys.argv[1:] if arguments is None else arguments)
+        if arguments and arguments[0] in COMMANDS:
+            command = importlib.import_module(f"train.commands.{arguments[0]}")
+            return command.main(arguments[1:])
+        options = parse(arguments)
         from train import loop  # Only now: `--help` and mistakes in options shall not wait for Gymnasium.
 
         return 0 if loop.run(options) else 130
@@ -58,7 +64,9 @@ def parse(arguments: Sequence[str]) -> Options:
     return make_options(backend, given, overrides, preset)
 
 
-class _Parser(argparse.ArgumentParser):
+class Parser(argparse.ArgumentParser):
+    """Mistakes are UserErrors."""
+
     def error(self, message: str) -> NoReturn:
         raise UserError(f"{message} (see train --help)")
 
@@ -70,7 +78,7 @@ class _Formatter(argparse.RawDescriptionHelpFormatter):
 
 def build_parser() -> argparse.ArgumentParser:
     """Every option without a default: what is not given comes from the preset, see train/options.py."""
-    parser = _Parser(
+    parser = Parser(
         prog="train", description=DESCRIPTION, formatter_class=_Formatter, usage="train --backend {jax,torch} [options]", allow_abbrev=False
     )
     base = presets()["base"]
