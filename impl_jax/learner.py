@@ -27,7 +27,7 @@ class Learner:
       ValueError: an unknown device, or one that this installation of JAX does not have.
     """
 
-    def __init__(self, spaces: Spaces, config: Config, *, seed: int, device: str | None = None) -> None:
+    def __init__(self, spaces: Spaces, config: Config, *, seed: int, device: str | None = None, nonfinite: str = "stop") -> None:
         if config.compute_dtype == "float64":
             jax.config.update("jax_enable_x64", True)
         self.spaces, self.config = spaces, config
@@ -47,6 +47,20 @@ class Learner:
         carry = {key: jnp.zeros(shape, dtype) for key, shape in shapes.items()}
         carry["action"] = jnp.zeros((envs, self.spaces.action_size), exact_dtype(config))
         return jax.device_put(carry, self._device)
+
+    def save_carry(self, carry: Any) -> dict[str, np.ndarray]:
+        """A carry as arrays, exactly: what is bfloat16 becomes float32."""
+        return {key: np.asarray(value.astype(jnp.float32) if value.dtype == jnp.bfloat16 else value) for key, value in carry.items()}
+
+    def load_carry(self, arrays: Arrays) -> Any:
+        """The inverse of `save_carry`. [CON-5]"""
+        zeros = self.initial_carry(len(arrays["action"]))
+        return jax.device_put({key: jnp.asarray(arrays[key], value.dtype) for key, value in zeros.items()}, self._device)
+
+    def memory(self) -> int | None:
+        """Bytes in use on the accelerator; None without one."""
+        statistics = None if self._device.platform == "cpu" else self._device.memory_stats()
+        return statistics and statistics.get("bytes_in_use")
 
     def policy(self, observation: Arrays, is_first: np.ndarray, carry: Any, seed: int) -> tuple[np.ndarray, Arrays, Any]:
         """One acting step of N environments. [AGT-11]

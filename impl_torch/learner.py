@@ -33,7 +33,7 @@ class Learner:
       ValueError: a device that is unknown or not there.
     """
 
-    def __init__(self, spaces: Spaces, config: Config, *, seed: int, device: str | None = None) -> None:
+    def __init__(self, spaces: Spaces, config: Config, *, seed: int, device: str | None = None, nonfinite: str = "stop") -> None:
         self.spaces, self.config = spaces, config
         self._device = select_device(device)
         self.device = str(self._device)
@@ -62,8 +62,22 @@ class Learner:
     def initial_carry(self, envs: int) -> dict[str, Tensor]:
         """All zeros: {"deter" [N, D], "stoch" [N, S, C], "action" [N, A]}. [CON-5]"""
         c = self.config
-        shapes = {"deter": (c.deter,), "stoch": (c.stoch, c.classes), "action": (self.spaces.action_size,)}
-        return {name: torch.zeros(envs, *shape, dtype=compute_dtype(c), device=self._device) for name, shape in shapes.items()}
+        shapes = {"deter": (c.deter,), "stoch": (c.stoch, c.classes)}
+        carry = {name: torch.zeros(envs, *shape, dtype=compute_dtype(c), device=self._device) for name, shape in shapes.items()}
+        return carry | {"action": torch.zeros(envs, self.spaces.action_size, dtype=self._dtype, device=self._device)}
+
+    def save_carry(self, carry: Mapping[str, Tensor]) -> dict[str, np.ndarray]:
+        """A carry as arrays, exactly: what is bfloat16 becomes float32."""
+        return {name: (x.float() if x.dtype == torch.bfloat16 else x).numpy(force=True) for name, x in carry.items()}
+
+    def load_carry(self, arrays: Arrays) -> dict[str, Tensor]:
+        """The inverse of `save_carry`. [CON-5]"""
+        zeros = self.initial_carry(len(arrays["action"]))
+        return {name: torch.tensor(arrays[name]).to(x) for name, x in zeros.items()}
+
+    def memory(self) -> int | None:
+        """Bytes in use on the accelerator; None without one."""
+        return torch.cuda.memory_allocated(self._device) if self._device.type == "cuda" else None
 
     @torch.no_grad()
     def policy(

@@ -21,10 +21,19 @@ class Learner(Protocol):
 
     device: str
 
-    def __init__(self, spaces: Spaces, config: Config, *, seed: int, device: str | None = None) -> None: ...
+    def __init__(self, spaces: Spaces, config: Config, *, seed: int, device: str | None = None, nonfinite: str = "stop") -> None: ...
 
     def initial_carry(self, envs: int) -> Any:
         """The carry of `envs` environments before their first step; opaque to the caller."""
+
+    def save_carry(self, carry: Any) -> dict[str, np.ndarray]:
+        """A carry as arrays, exactly: what is bfloat16 becomes float32."""
+
+    def load_carry(self, arrays: Arrays) -> Any:
+        """The inverse of `save_carry`, of this backend's or of another's carry."""
+
+    def memory(self) -> int | None:
+        """Bytes in use on the accelerator; None without one."""
 
     def policy(self, observation: Arrays, is_first: np.ndarray, carry: Any, seed: int) -> tuple[np.ndarray, Arrays, Any]:
         """One acting step of N environments: [AGT] policy step.

@@ -3,11 +3,13 @@
 from train.envs.adapter import ContractEnv
 from train.envs.factory import make_env
 from train.envs.spaces import Translation, random_actions, translate
-from train.envs.vector import Environments, Record, is_slow
+from train.envs.vector import Environments, Failure, History, Record, is_slow
 
 __all__ = [
     "ContractEnv",
     "Environments",
+    "Failure",
+    "History",
     "Record",
     "Translation",
     "is_slow",

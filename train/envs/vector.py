@@ -4,6 +4,7 @@ Gymnasium's autoreset mode NEXT_STEP gives these streams: the step after the end
 observation with reward 0. So the last observation of an episode is a record of its own, with its reward and its flags.
 """
 
+import dataclasses
 import functools
 import multiprocessing
 import signal
@@ -23,6 +24,29 @@ from train.envs.spaces import random_actions
 from train.errors import UserError
 
 Record = dict[str, np.ndarray]
+
+
+@dataclasses.dataclass(frozen=True)
+class Failure:
+    worker: int
+    kind: str
+    message: str
+
+
+@dataclasses.dataclass(frozen=True)
+class History:
+    seed: int
+    episode: int
+    actions: np.ndarray
+
+    def to_json(self) -> dict[str, Any]:
+        return {"seed": self.seed, "episode": self.episode}
+
+    @classmethod
+    def from_json(cls, entry: dict[str, Any], actions: np.ndarray) -> "History":
+        return cls(**entry, actions=actions)
+
+
 FLAGS = ("is_first", "is_last", "is_terminal")
 
 SLOW_STEP = 5e-4  # seconds; from here on a process of its own is faster than taking turns
@@ -37,8 +61,11 @@ class Environments:
     they have processes of their own. `reset(seeds)` begins everywhere anew, and seeds this episode and all after it.
     """
 
-    def __init__(self, make: Callable[[int], ContractEnv], count: int, processes: bool) -> None:
+    def __init__(
+        self, make: Callable[[int], ContractEnv], count: int, processes: bool, timeout: float = 600.0, failures_allowed: int = 10
+    ) -> None:
         self.count = count
+        self.failures = 0
         self._action: np.ndarray | None = None
         self._pending = False  # whether worker processes owe an answer, or failed to give one
         self._is_last = np.zeros(self.count, bool)
@@ -82,6 +109,15 @@ class Environments:
         is_first = self._is_last
         self._is_last = terminated | truncated
         return self._record(observation, reward, is_first, self._is_last, terminated)
+
+    def take_failures(self) -> list[Failure]:
+        return []
+
+    def histories(self) -> list[History | None]:
+        return [None] * self.count
+
+    def restore(self, histories: list[History | None]) -> Record | None:
+        return None
 
     def step(self, action: np.ndarray) -> Record:
         """`start` and `finish` in one."""

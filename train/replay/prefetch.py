@@ -53,14 +53,16 @@ class Prefetcher:
         self._drawn = self._draw(self.step)
         return batch
 
-    def write_back(self, ids: Any, latents: Mapping[str, Any]) -> None:
+    def write_back(self, ids: Any, latents: Mapping[str, Any], computed: Callable[[], None] = lambda: None) -> None:
         """Hands over the latents of the train step whose batch was taken last. Does not wait for them: they may still be computed.
+
+        computed: called in the thread when they are there.
 
         Raises:
           whatever the write-back before has raised.
         """
         self._settle_write_back()
-        self._written = self._thread.submit(self._write_back, ids, dict(latents))
+        self._written = self._thread.submit(self._write_back, ids, dict(latents), computed)
 
     def pack(self, steps: Mapping[str, Any]) -> Packed:
         """See Replay.pack."""
@@ -107,8 +109,10 @@ class Prefetcher:
     def _draw(self, step: int) -> "concurrent.futures.Future[Batch]":
         return self._thread.submit(lambda: self.replay.sample(self._uniform(step)))
 
-    def _write_back(self, ids: Any, latents: Mapping[str, Any]) -> None:
-        self.replay.write_back(ids, {name: np.asarray(value) for name, value in latents.items()})
+    def _write_back(self, ids: Any, latents: Mapping[str, Any], computed: Callable[[], None]) -> None:
+        arrays = {name: np.asarray(value) for name, value in latents.items()}
+        computed()
+        self.replay.write_back(ids, arrays)
 
     def _settle_draw(self) -> None:
         if self._drawn is not None:
