@@ -20,13 +20,14 @@ from safetensors.numpy import save_file
 
 from reference_numpy import agent, training_loop
 from reference_numpy.shapes import require_shape
-from spec import Config, Discrete, Parameter, Spaces, Vector, load_config, parameter_table
+from spec import Config, Discrete, Parameter, Spaces, Vector, hyperparameters, load_config, parameter_table
+from train.checkpoint import Checkpoint
 from train.errors import UserError
 from train.files import Arrays, flush, read_arrays, read_json, require_intact, seal
 
 FORMAT = 1
 PARAMETERS, DESCRIPTION = "policy.safetensors", "policy.json"
-ENTRIES = {"task": str, "step": int, "backend": str, "action_repeat": int, "image_size": int, "source": dict, "versions": dict}
+INFO = {"task": str, "step": int, "backend": str, "action_repeat": int, "image_size": int, "source": dict, "versions": dict}
 MOST_LAYERS = 1000  # of a network: a description is not believed that would need more memory than its parameters
 
 
@@ -55,8 +56,8 @@ class Policy:
             info = read_json(path / DESCRIPTION)
             if info.get("format") != FORMAT:
                 raise ValueError(f"{DESCRIPTION} has format {info.get('format')!r}; this version reads format {FORMAT}")
-            checked_info(info)
             spaces, config = Spaces.from_json(info.pop("spaces", None)), config_from_json(info.pop("config", None))
+            check_info(info, spaces)
             parameters = checked_parameters(read_arrays(path / PARAMETERS), acting_table(config, spaces))
         except (OSError, ValueError) as error:
             raise UserError(f"cannot load the policy {path}: {error}; `train export` writes it anew") from error
@@ -152,7 +153,7 @@ def save(path: Path, parameters: Mapping[str, Any], spaces: Spaces, config: Conf
 
     Args:
       parameters: name -> float32, at least those of `acting_table`; others are left out.
-      info: task, step, backend, action_repeat, image_size, source.
+      info: the entries of INFO.
 
     Raises:
       UserError: the path exists already, or the disk refuses.
@@ -160,7 +161,7 @@ def save(path: Path, parameters: Mapping[str, Any], spaces: Spaces, config: Conf
     if path.exists():
         raise UserError(f"{path} exists already; remove it, or choose another folder for the policy")
     temporary = path.with_name(f"{path.name}.tmp")
-    description = {"format": FORMAT, **info, "versions": versions(), "spaces": spaces.to_json(), "config": dataclasses.asdict(config)}
+    description = {"format": FORMAT, **info, "spaces": spaces.to_json(), "config": dataclasses.asdict(config)}
     try:
         shutil.rmtree(temporary, ignore_errors=True)
         temporary.mkdir(parents=True)
@@ -185,24 +186,31 @@ def agent_of(checkpoint: Checkpoint) -> tuple[Config, Spaces, dict[str, Any]]:
             raise ValueError("run.json: expected the objects identity and counters")
         config = config_from_json({name: identity[name] for name in hyperparameters() if name in identity})
         spaces = Spaces.from_json(checkpoint.info.get("spaces"))
-        info = {name: identity.get(name) for name in ("task", "action_repeat", "image_size")}
-        info |= {"step": counters.get("records"), "backend": checkpoint.info.get("backend")}
-        info |= {"source": {"checkpoint": str(checkpoint.path), "seed": identity.get("seed"), "train_steps": counters.get("train_steps")}}
-        checked_info(info)
+        info: dict[str, Any] = {name: identity.get(name) for name in ("task", "action_repeat", "image_size")}
+        info |= {"step": counters.get("records"), "backend": checkpoint.info.get("backend"), "versions": versions()}
+        info["source"] = {"checkpoint": str(checkpoint.path), "seed": identity.get("seed"), "train_steps": counters.get("train_steps")}
+        check_info(info, spaces)
+        info["step"] *= info["action_repeat"]
     except ValueError as error:
         raise UserError(f"the checkpoint {checkpoint.path} does not describe an agent: {error}") from error
-    return config, spaces, info | {"step": info["step"] * info["action_repeat"]}
+    return config, spaces, info
 
 
-def checked_info(info: Mapping[str, Any]) -> None:
+def check_info(info: Mapping[str, Any], spaces: Spaces) -> None:
     """Raises:
-    ValueError: an entry of `info` is missing or of another kind.
+    ValueError: an entry of `info` is missing, of another kind, or not what the spaces say.
     """
-    for name, kind in ENTRIES.items():
+    for name, kind in INFO.items():
         if type(info.get(name)) is not kind:
             raise ValueError(f"expected a {kind.__name__} as {name}, got {info.get(name)!r:.80}")
-    if not info["task"].isprintable() or min(info["step"], info["action_repeat"] - 1, info["image_size"] - 1) < 0:
-        raise ValueError(...)
+    if not info["task"].isprintable():
+        raise ValueError(f"the task {info['task']!r:.80} holds characters that cannot be printed")
+    for name, least in (("step", 0), ("action_repeat", 1), ("image_size", 1)):
+        if info[name] < least:
+            raise ValueError(f"{name} is {info[name]}; expected at least {least}")
+    for key, image in spaces.images.items():
+        if image.height != info["image_size"] or image.width != info["image_size"]:
+            raise ValueError(f"the image {key!r} is {image.height} x {image.width}, but image_size is {info['image_size']}")
 
 
 def acting_table(config: Config, spaces: Spaces) -> dict[str, Parameter]:
@@ -250,7 +258,7 @@ def config_from_json(values: Any) -> Config:
 
 
 def versions() -> dict[str, str]:
-    """Of what writes a policy."""
+    """Of what writes a policy now."""
     try:
         own = importlib.metadata.version("dreamer-spec")
     except importlib.metadata.PackageNotFoundError:  # run from a clone
