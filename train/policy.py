@@ -7,9 +7,7 @@ policy/
 """
 
 import dataclasses
-import importlib.metadata
 import json
-import platform
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -20,15 +18,13 @@ from safetensors.numpy import save_file
 
 from reference_numpy import agent, training_loop
 from reference_numpy.shapes import require_shape
-from spec import Config, Discrete, Parameter, Spaces, Vector, hyperparameters, load_config, parameter_table
-from train.checkpoint import Checkpoint
+from spec import Discrete, Spaces, Vector
 from train.errors import UserError
-from train.files import Arrays, flush, read_arrays, read_json, require_intact, seal
+from train.files import flush, read_arrays, read_json, require_intact, seal
+from train.saved_agent import SavedAgent, acting_table, check_info, checked_parameters, config_from_json
 
 FORMAT = 1
 PARAMETERS, DESCRIPTION = "policy.safetensors", "policy.json"
-INFO = {"task": str, "step": int, "backend": str, "action_repeat": int, "image_size": int, "source": dict, "versions": dict}
-MOST_LAYERS = 1000  # of a network: a description is not believed that would need more memory than its parameters
 
 
 class Policy:
@@ -38,9 +34,9 @@ class Policy:
     image_size, source, versions.
     """
 
-    def __init__(self, parameters: Mapping[str, Any], spaces: Spaces, config: Config, info: Mapping[str, Any]) -> None:
-        self.spaces, self.config, self.info = spaces, config, info
-        self._parameters = {name: np.asarray(array, np.float64) for name, array in parameters.items()}  # once, not in every step
+    def __init__(self, saved: SavedAgent) -> None:
+        self.spaces, self.config, self.info = saved.spaces, saved.config, saved.info
+        self._parameters = {name: np.asarray(array, np.float64) for name, array in saved.parameters.items()}  # once, not in every step
         self.reset(0)
 
     @classmethod
@@ -61,7 +57,7 @@ class Policy:
             parameters = checked_parameters(read_arrays(path / PARAMETERS), acting_table(config, spaces))
         except (OSError, ValueError) as error:
             raise UserError(f"cannot load the policy {path}: {error}; `train export` writes it anew") from error
-        return cls(parameters, spaces, config, info)
+        return cls(SavedAgent(config, spaces, parameters, info))
 
     def reset(self, n: int, seed: int = 0) -> None:
         """Begins anew in `n` environments. seed: of the noise that the steps from here on draw."""
@@ -92,6 +88,8 @@ class Policy:
             raise ValueError(f"is_first: expected the dtype bool, got {is_first.dtype}")
         observation = {key: self._observation(key, observation) for key in self.spaces.observations}
         noise = self._draw_noise() if noise is None else noise
+        if set(noise) != {"posterior", "action"}:
+            raise ValueError(f"noise: expected the entries posterior and action, got {sorted(noise)}")
         carry, action = agent.policy_step(
             self._parameters, self._carry, self._action, observation, is_first, noise, self.spaces, self.config
         )
@@ -148,12 +146,8 @@ class Policy:
         return {"posterior": posterior, "action": np.concatenate(parts, axis=-1)}
 
 
-def save(path: Path, parameters: Mapping[str, Any], spaces: Spaces, config: Config, info: Mapping[str, Any]) -> None:
+def save(path: Path, saved: SavedAgent) -> None:
     """Writes a policy folder under another name, then renames it: it is complete or absent.
-
-    Args:
-      parameters: name -> float32, at least those of `acting_table`; others are left out.
-      info: the entries of INFO.
 
     Raises:
       UserError: the path exists already, or the disk refuses.
@@ -161,106 +155,15 @@ def save(path: Path, parameters: Mapping[str, Any], spaces: Spaces, config: Conf
     if path.exists():
         raise UserError(f"{path} exists already; remove it, or choose another folder for the policy")
     temporary = path.with_name(f"{path.name}.tmp")
-    description = {"format": FORMAT, **info, "spaces": spaces.to_json(), "config": dataclasses.asdict(config)}
+    description = {"format": FORMAT, **saved.info, "spaces": saved.spaces.to_json(), "config": dataclasses.asdict(saved.config)}
+    acting = {name: saved.parameters[name] for name in acting_table(saved.config, saved.spaces)}
     try:
         shutil.rmtree(temporary, ignore_errors=True)
         temporary.mkdir(parents=True)
-        save_file({name: np.ascontiguousarray(parameters[name]) for name in acting_table(config, spaces)}, temporary / PARAMETERS)
+        save_file(acting, temporary / PARAMETERS)
         (temporary / DESCRIPTION).write_text(json.dumps(description, indent=2) + "\n", encoding="utf-8")
         seal(temporary, (PARAMETERS, DESCRIPTION))
         temporary.rename(path)
         flush(path.parent)
     except OSError as error:
         raise UserError(f"cannot write the policy {path}: {error}") from error
-
-
-def agent_of(checkpoint: Checkpoint) -> tuple[Config, Spaces, dict[str, Any]]:
-    """What a checkpoint says of its agent: configuration, spaces, and `info` as `save` takes it.
-
-    Raises:
-      UserError: it does not say it, or it contradicts itself.
-    """
-    identity, counters = checkpoint.info.get("identity"), checkpoint.info.get("counters")
-    try:
-        if not isinstance(identity, dict) or not isinstance(counters, dict):
-            raise ValueError("run.json: expected the objects identity and counters")
-        config = config_from_json({name: identity[name] for name in hyperparameters() if name in identity})
-        spaces = Spaces.from_json(checkpoint.info.get("spaces"))
-        info: dict[str, Any] = {name: identity.get(name) for name in ("task", "action_repeat", "image_size")}
-        info |= {"step": counters.get("records"), "backend": checkpoint.info.get("backend"), "versions": versions()}
-        info["source"] = {"checkpoint": str(checkpoint.path), "seed": identity.get("seed"), "train_steps": counters.get("train_steps")}
-        check_info(info, spaces)
-        info["step"] *= info["action_repeat"]
-    except ValueError as error:
-        raise UserError(f"the checkpoint {checkpoint.path} does not describe an agent: {error}") from error
-    return config, spaces, info
-
-
-def check_info(info: Mapping[str, Any], spaces: Spaces) -> None:
-    """Raises:
-    ValueError: an entry of `info` is missing, of another kind, or not what the spaces say.
-    """
-    for name, kind in INFO.items():
-        if type(info.get(name)) is not kind:
-            raise ValueError(f"expected a {kind.__name__} as {name}, got {info.get(name)!r:.80}")
-    if not info["task"].isprintable():
-        raise ValueError(f"the task {info['task']!r:.80} holds characters that cannot be printed")
-    for name, least in (("step", 0), ("action_repeat", 1), ("image_size", 1)):
-        if info[name] < least:
-            raise ValueError(f"{name} is {info[name]}; expected at least {least}")
-    for key, image in spaces.images.items():
-        if image.height != info["image_size"] or image.width != info["image_size"]:
-            raise ValueError(f"the image {key!r} is {image.height} x {image.width}, but image_size is {info['image_size']}")
-
-
-def acting_table(config: Config, spaces: Spaces) -> dict[str, Parameter]:
-    """The entries of the parameter table that the policy step reads: encoder, recurrent model without the prior, actor."""
-    return {
-        name: entry
-        for name, entry in parameter_table(config, spaces).items()
-        if name.startswith(("encoder/", "rssm/", "actor/")) and not name.startswith("rssm/prior/")
-    }
-
-
-def checked_parameters(arrays: Mapping[str, np.ndarray], table: Mapping[str, Parameter]) -> Arrays:
-    """The arrays, after they were compared with the parameter table.
-
-    Raises:
-      ValueError: other names, shapes or dtypes than the table's in float32, or a number that is not finite.
-    """
-    if names := sorted(set(arrays) ^ set(table)):
-        raise ValueError(f"parameters that are missing or too many for this configuration: {', '.join(names[:5])}")
-    for name, entry in table.items():
-        require_shape(f"parameter {name}", arrays[name].shape, *entry.shape)
-        if arrays[name].dtype != np.float32:
-            raise ValueError(f"parameter {name}: expected the dtype float32, got {arrays[name].dtype}")
-        if not np.isfinite(arrays[name]).all():
-            raise ValueError(f"parameter {name} holds numbers that are not finite")
-    return dict(arrays)
-
-
-def config_from_json(values: Any) -> Config:
-    """The inverse of `dataclasses.asdict` through JSON.
-
-    Raises:
-      ValueError: a hyperparameter is missing, unknown or has a value that no agent could have.
-    """
-    if not isinstance(values, dict):
-        raise ValueError(f"configuration: expected an object, got {values!r:.80}")
-    if names := sorted(set(values) ^ {field.name for field in dataclasses.fields(Config)}):
-        raise ValueError(f"hyperparameters that are missing or unknown: {', '.join(names[:5])}")
-    config = load_config(**values)
-    for name, value in values.items():
-        count = len(value) if isinstance(value, list) else value
-        if (name.endswith("_layers") or isinstance(value, list)) and count > MOST_LAYERS:
-            raise ValueError(f"hyperparameter {name} is {value!r:.80}; expected at most {MOST_LAYERS} layers")
-    return config
-
-
-def versions() -> dict[str, str]:
-    """Of what writes a policy now."""
-    try:
-        own = importlib.metadata.version("dreamer-spec")
-    except importlib.metadata.PackageNotFoundError:  # run from a clone
-        own = "unknown"
-    return {"dreamer-spec": own, "python": platform.python_version(), "numpy": np.__version__}

@@ -1,3 +1,6 @@
 """The commands beside training: `train NAME ...` calls `main(arguments)` of the module of that name."""
 
-COMMANDS: dict[str, str] = {}  # name -> what it does, for --help
+COMMANDS: dict[str, str] = {  # name -> what it does, for --help
+    "eval": "plays episodes with a checkpoint, on either backend",
+    "export": "writes the policy of a checkpoint as a folder that runs with NumPy alone",
+}
