@@ -115,10 +115,10 @@ def open_checkpoint(path: Path) -> Checkpoint:
     try:
         info = read_json(path / "run.json")
         if info.get("format") != FORMAT:
-            raise UserError(f"the checkpoint {path} has format {info.get('format')}; this version reads format {FORMAT}")
+            raise UserError(f"the checkpoint {path} has format {info.get('format')!r:.80}; this version reads format {FORMAT}")
         require_intact(path, FILES)
     except (OSError, ValueError) as error:
-        raise Damaged(f"the checkpoint {path} is damaged: {error}") from error
+        raise Damaged(f"the checkpoint {path} is damaged: {error!s:.500}") from error
     return Checkpoint(path, info)
 
 
@@ -167,4 +167,4 @@ def _read_arrays(path: Path) -> Arrays:
     try:
         return read_arrays(path)
     except (OSError, ValueError) as error:
-        raise Damaged(f"the checkpoint {path.parent} is damaged: {error}") from error
+        raise Damaged(f"the checkpoint {path.parent} is damaged: {error!s:.500}") from error

@@ -51,12 +51,12 @@ class Policy:
             require_intact(path, (PARAMETERS, DESCRIPTION))
             info = read_json(path / DESCRIPTION)
             if info.get("format") != FORMAT:
-                raise ValueError(f"{DESCRIPTION} has format {info.get('format')!r}; this version reads format {FORMAT}")
+                raise ValueError(f"{DESCRIPTION} has format {info.get('format')!r:.80}; this version reads format {FORMAT}")
             spaces, config = Spaces.from_json(info.pop("spaces", None)), config_from_json(info.pop("config", None))
             check_info(info, spaces)
             parameters = checked_parameters(read_arrays(path / PARAMETERS), acting_table(config, spaces))
         except (OSError, ValueError) as error:
-            raise UserError(f"cannot load the policy {path}: {error}; `train export` writes it anew") from error
+            raise UserError(f"cannot load the policy {path}: {error!s:.500}; `train export` writes it anew") from error
         return cls(SavedAgent(config, spaces, parameters, info))
 
     def reset(self, n: int, seed: int = 0) -> None:

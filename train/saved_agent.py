@@ -48,7 +48,7 @@ def agent_of(checkpoint: Checkpoint) -> SavedAgent:
         trained = {name.removeprefix("params/"): array for name, array in state.items() if name.startswith("params/")}
         return SavedAgent(config, spaces, checked_parameters(trained, parameter_table(config, spaces)), info)
     except ValueError as error:
-        raise UserError(f"the checkpoint {checkpoint.path} does not hold an agent: {error}") from error
+        raise UserError(f"the checkpoint {checkpoint.path} does not hold an agent: {error!s:.500}") from error
 
 
 def config_from_json(values: Any) -> Config:

@@ -1,0 +1,343 @@
+"""Mutated checkpoints and policies: every outcome is what was written, another sound agent, or a clear error.
+
+Half of the mutants get checksums that agree with them, as a forger's would. The mutants are loaded in a process of its own with little
+memory: who believes a size before looking at it fails there. `python tests/test_train_files_fuzz.py FIRST LAST` is that process.
+"""
+
+import collections
+import copy
+import dataclasses
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from train_agents import save_checkpoint
+
+from conformance.problems import random_observations, small_config
+from spec import Discrete, Image, Spaces, Vector
+from train.checkpoint import FILES, open_checkpoint
+from train.errors import UserError
+from train.files import seal
+from train.policy import DESCRIPTION, PARAMETERS, Policy, save
+from train.saved_agent import SavedAgent, agent_of
+
+CONFIG = small_config("paper", "float32")
+TASK = Spaces({"position": Vector(3), "mode": Discrete((3, 2)), "image": Image(16, 16, 3)}, {"arm": Vector(2), "buttons": Discrete((2, 3))})
+MEMORY = Path("/dev/shm") if Path("/dev/shm").is_dir() else None
+HEADROOM = 256 * 2**20  # bytes of address space beyond those of the process before the first mutant
+LONGEST = 20  # seconds for one mutant
+LONGEST_MESSAGE = 1000  # characters
+
+# Mutations of the bytes of a file
+
+
+def flip_bit(data: bytearray, chance: random.Random) -> None:
+    data[chance.randrange(len(data))] ^= 1 << chance.randrange(8)
+
+
+def overwrite(data: bytearray, chance: random.Random) -> None:
+    where = chance.randrange(len(data))
+    data[where : where + 8] = chance.randbytes(8)
+
+
+def zero(data: bytearray, chance: random.Random) -> None:
+    where = chance.randrange(len(data))
+    data[where : where + 64] = bytes(len(data[where : where + 64]))
+
+
+def cut(data: bytearray, chance: random.Random) -> None:
+    del data[chance.randrange(len(data)) :]
+
+
+def grow(data: bytearray, chance: random.Random) -> None:
+    data += chance.randbytes(chance.randrange(1, 100))
+
+
+def reverse(data: bytearray, chance: random.Random) -> None:
+    where = chance.randrange(len(data))
+    data[where:] = data[where:][::-1]
+
+
+def hostile_number(data: bytearray, chance: random.Random) -> None:
+    """A NaN, an infinity or a huge number among the parameters, or a wrong length of the header."""
+    where = chance.choice([0, 4, 4 * chance.randrange(len(data) // 4)])
+    data[where : where + 4] = np.float32(chance.choice([np.nan, np.inf, -3e38, 1e-45])).tobytes()
+
+
+BYTES: list[Callable[[bytearray, random.Random], None]] = [flip_bit, overwrite, zero, cut, grow, reverse, hostile_number]
+
+# Mutations of JSON: of a description, or of the header of a safetensors file
+
+HOSTILE: list[Any] = [
+    *(None, True, False, -1, 0, 1, 2, 7, 2**31, 2**53, 2**63 - 1, 2**64, 10**400, 0.5, -0.0, 1e308, float("nan"), float("inf")),
+    *("", "x", "x" * 100_000, "\ud800", "../../etc/passwd", "vector", "image", [], {}, [0], [2**40, 2**40], [1] * 70, {"kind": "image"}),
+    *("F64", "BF16", "F8_E4M3", "BOOL", "C64", [0, 2**60], [0, 0], [[[[[[]]]]]], [-1, 4], ["a"], [2] * 5000),
+]
+
+
+def places(value: Any) -> list[tuple[Any, Any]]:
+    """Every (container, key) in a tree of JSON."""
+    found: list[tuple[Any, Any]] = []
+    entries = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, entry in entries:
+        found += [(value, key), *places(entry)]
+    return found
+
+
+def edit(tree: Any, chance: random.Random) -> str:
+    """The text of a tree of JSON after an edit or two."""
+    for _ in range(chance.randrange(1, 3)):
+        found = places(tree)
+        if not found:
+            break
+        container, key = chance.choice(found)
+        kind = chance.choice(["value", "value", "value", "number", "missing", "rename", "exchange"])
+        if kind == "missing":
+            del container[key]
+        elif kind == "rename" and isinstance(container, dict):
+            container[chance.choice(["", "x", "params/", "../x", "\u0000"])] = container.pop(key)
+        elif kind == "exchange":
+            other, other_key = chance.choice(found)
+            container[key], other[other_key] = other[other_key], container[key]
+            if cyclic(tree):
+                return "{}"
+        elif kind == "number" and type(container[key]) is int:
+            container[key] = max(0, container[key] + chance.choice([-1, 1, 4, 100])) * chance.choice([1, 1, 2, 10**9])
+        else:
+            container[key] = copy.deepcopy(chance.choice(HOSTILE))
+    text = json.dumps(tree, allow_nan=True)
+    kind = chance.randrange(12)
+    if kind == 0:  # a name twice
+        entry = text[1 : text.find(",")]
+        text = f"{{{entry},{text[1:]}"
+    elif kind == 1:  # deep
+        text = text.replace("[", "[" * chance.choice([100, 100_000]), 1)
+    elif kind == 2:
+        text = chance.choice(["", "null", "[]", "3", '"x"', "{" * 50_000, '{"a":' * 50_000, "[" * 500_000, " " * (2**20 + 1), "\ufeff{}"])
+    return text
+
+
+def cyclic(tree: Any) -> bool:
+    try:
+        json.dumps(tree)
+    except (ValueError, RecursionError):
+        return True
+    return False
+
+
+def relabel(header: dict[str, Any], chance: random.Random) -> str:
+    """A header that the format allows and that says something else of one array or two."""
+    one, other = chance.sample(sorted(header), 2)
+    entry = header[one]
+    kind = chance.choice(["dtype", "dtype", "shape", "exchange", "flatten", "empty", "axes"])
+    if kind == "dtype":
+        entry["dtype"] = chance.choice(["I32", "U32", "F16", "BF16", "F64", "C64", "F8_E4M3", "F8_E5M2", "F4", "BOOL", "I8"])
+        size = {"F16": 2, "BF16": 2, "F64": 8, "C64": 8, "F4": 0.5, "I32": 4, "U32": 4}.get(entry["dtype"], 1)
+        first, last = entry["data_offsets"]
+        entry["shape"] = [int((last - first) / size)]
+    elif kind == "shape":
+        entry["shape"] = entry["shape"][::-1]
+    elif kind == "exchange":
+        header[one], header[other] = header[other], header[one]
+    elif kind == "flatten":
+        entry["shape"] = [int(np.prod(entry["shape"]))]
+    elif kind == "empty":
+        sides = chance.choice([[0], [0, 2**40], [2**63, 0], [0] * 40])
+        header[chance.choice(["params/x", "x", one + "/x"])] = {"dtype": "F32", "shape": sides, "data_offsets": [0, 0]}
+    else:
+        entry["shape"] += [1] * chance.choice([1, 40, 100])
+    return json.dumps(header)
+
+
+def edit_header(data: bytes, chance: random.Random) -> bytes:
+    length = int.from_bytes(data[:8], "little")
+    header = json.loads(data[8 : 8 + length])
+    if chance.random() < 0.5:
+        text = relabel(header, chance).encode()
+        return len(text).to_bytes(8, "little") + text + data[8 + length :]
+    text = edit(header, chance).encode("utf-8", "surrogatepass")
+    said = chance.choice([len(text)] * 8 + [0, len(text) - 1, len(text) + 1, 2**27, 2**40, 2**63])
+    return said.to_bytes(8, "little") + text + data[8 + length :]
+
+
+# Mutations of a folder
+
+
+def mutate(folder: Path, names: tuple[str, ...], chance: random.Random) -> str:
+    """Spoils one file or two of a folder. Returns how."""
+    kinds = ["bytes", "json", "json", "header", "header", "swap", "missing", "irregular", "copy"]
+    kind = chance.choice(kinds)
+    if kind == "swap":
+        one, other = (folder / name for name in chance.sample([*names, "SHA256SUMS"], 2))
+        content = one.read_bytes()
+        one.write_bytes(other.read_bytes())
+        other.write_bytes(content)
+    elif kind == "copy":
+        one, other = chance.sample(names, 2)
+        shutil.copyfile(folder / one, folder / other)
+    elif kind in ("missing", "irregular"):
+        path = folder / chance.choice([*names, "SHA256SUMS"])
+        path.unlink()
+        if kind == "irregular":
+            chance.choice([path.mkdir, lambda: os.mkfifo(path), lambda: path.symlink_to("/dev/zero"), lambda: path.symlink_to(path)])()
+    elif kind == "json":
+        path = next(folder / name for name in names if name.endswith(".json"))
+        path.write_bytes(edit(json.loads(path.read_text()), chance).encode("utf-8", "surrogatepass"))
+    elif kind == "header":
+        path = folder / chance.choice([name for name in names if name.endswith(".safetensors")])
+        path.write_bytes(edit_header(path.read_bytes(), chance))
+    else:
+        for _ in range(chance.randrange(1, 3)):
+            path = folder / chance.choice([*names, "SHA256SUMS"])
+            data = bytearray(path.read_bytes())
+            if data:
+                chance.choice(BYTES)(data, chance)
+            path.write_bytes(data)
+    return kind
+
+
+# What comes of it
+
+
+def same(one: SavedAgent, other: SavedAgent) -> bool:
+    arrays = zip(one.parameters.items(), other.parameters.items(), strict=True)
+    equal = all(name == other_name and a.tobytes() == b.tobytes() for (name, a), (other_name, b) in arrays)
+    info = [{name: value for name, value in agent.info.items() if name != "source"} for agent in (one, other)]
+    return equal and info[0] == info[1] and (one.config, one.spaces) == (other.config, other.spaces)
+
+
+def act(policy: Policy) -> None:
+    """A few actions, which are finite or refused. Huge parameters overflow on their way there."""
+    policy.reset(2)
+    observation = random_observations(np.random.default_rng(0), policy.spaces, (2,))
+    try:
+        with np.errstate(all="ignore"):
+            for first in (True, False):
+                assert np.isfinite(policy(observation, [first, True])).all()
+    except ValueError:
+        pass
+
+
+def load_checkpoint(folder: Path) -> SavedAgent:
+    checkpoint = open_checkpoint(folder)
+    assert all(isinstance(array, np.ndarray) for array in checkpoint.loop.values())
+    agent = agent_of(checkpoint)
+    save(folder / "policy", agent)
+    act(Policy.load(folder / "policy"))
+    return agent
+
+
+def load_policy(folder: Path) -> SavedAgent:
+    policy = Policy.load(folder)
+    act(policy)
+    parameters = {name: array.astype(np.float32) for name, array in policy._parameters.items()}
+    return SavedAgent(policy.config, policy.spaces, parameters, dict(policy.info))
+
+
+@dataclasses.dataclass(frozen=True)
+class Original:
+    folder: Path
+    names: tuple[str, ...]
+    load: Callable[[Path], SavedAgent]
+
+
+def originals(directory: Path) -> list[Original]:
+    checkpoint = save_checkpoint(directory / "run", CONFIG, TASK, task="gym:Robot-v0", image_size=16)
+    save(directory / "policy", agent_of(open_checkpoint(checkpoint)))
+    return [Original(checkpoint, FILES, load_checkpoint), Original(directory / "policy", (PARAMETERS, DESCRIPTION), load_policy)]
+
+
+def outcome(original: Original, expected: SavedAgent, seed: int) -> tuple[str, str]:
+    """Mutates a copy and loads it. Returns how it was mutated and what came of it.
+
+    Raises:
+      Whatever is neither a sound agent nor a UserError.
+    """
+    chance = random.Random(seed)
+    with tempfile.TemporaryDirectory(dir=MEMORY) as name:
+        folder = Path(shutil.copytree(original.folder, Path(name) / original.folder.name))
+        kind = mutate(folder, original.names, chance)
+        forged = chance.random() < 0.7
+        if forged:
+            try:
+                if not (folder / "SHA256SUMS").is_file():
+                    os.unlink(folder / "SHA256SUMS")
+                seal(folder, original.names)
+            except (OSError, ValueError):
+                forged = False
+        try:
+            agent = original.load(folder)
+        except UserError as error:
+            if len(str(error)) > LONGEST_MESSAGE:
+                raise AssertionError(f"a message of {len(str(error))} characters") from None
+            return kind, "refused"
+        if same(agent, expected):
+            return kind, "equal"
+        assert forged, "a change that no checksum has noticed"
+        return kind, "another"
+
+
+def run(seeds: range) -> dict[str, Any]:
+    """Counts of outcomes by kind of mutation, the greatest growth of memory in MiB, and the time in seconds."""
+    import resource
+
+    def too_long(*_: Any) -> None:
+        raise TimeoutError(f"a mutant took longer than {LONGEST} seconds")
+
+    signal.signal(signal.SIGALRM, too_long)
+    counts: dict[str, collections.Counter[str]] = collections.defaultdict(collections.Counter)
+    with tempfile.TemporaryDirectory(dir=MEMORY) as name:
+        chosen = originals(Path(name))
+        expected = [original.load(Path(shutil.copytree(original.folder, Path(name) / f"copy{n}"))) for n, original in enumerate(chosen)]
+        used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (used + HEADROOM, used + HEADROOM))
+        resident, start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.monotonic()
+        for seed in seeds:
+            signal.alarm(LONGEST)
+            try:
+                kind, result = outcome(chosen[seed % 2], expected[seed % 2], seed)
+            except BaseException as error:
+                raise AssertionError(f"seed {seed}: {type(error).__name__}: {error}") from error
+            counts[kind][result] += 1
+        signal.alarm(0)
+        grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - resident) / 1024
+    return {"counts": counts, "grown": grown, "seconds": time.monotonic() - start}
+
+
+def mutants(first: int, last: int) -> collections.Counter[str]:
+    command = [sys.executable, __file__, str(first), str(last)]
+    root = str(Path(__file__).resolve().parent.parent)
+    environment = {**os.environ, "PYTHONPATH": root, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment)
+    assert done.returncode == 0, done.stderr[-4000:]
+    result = json.loads(done.stdout)
+    total: collections.Counter[str] = sum((collections.Counter(counts) for counts in result["counts"].values()), collections.Counter())
+    assert total.total() == last - first
+    assert result["grown"] < 128, result
+    return total
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="memory is limited as Linux does")
+def test_mutated_files_are_refused_or_sound() -> None:
+    assert set(mutants(0, 300)) == {"refused", "equal", "another"}
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="memory is limited as Linux does")
+def test_ten_thousand_mutations() -> None:
+    assert set(mutants(1000, 11_000)) == {"refused", "equal", "another"}
+
+
+if __name__ == "__main__":
+    print(json.dumps(run(range(int(sys.argv[1]), int(sys.argv[2])))))
