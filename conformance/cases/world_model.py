@@ -431,10 +431,10 @@ def open_loop_refuses(run: Run) -> None:
         rest = {name: other for name, other in drawn.observation.items() if name != key}
         for wrong in (rest, rest | {key: value[..., :-1]}, rest | {key: value[:, :-1]}, rest | {key: value[:1]}):
             run.refuses("open_loop", *dataclasses.replace(drawn, observation=wrong).arguments, naming=[key])
-    for shape in ((ROWS, STEPS, task.action_size - 1), (ROWS, STEPS - 1, task.action_size), (1, STEPS, task.action_size)):
-        run.refuses("open_loop", *dataclasses.replace(drawn, prev_action=np.zeros(shape)).arguments)
-    for shape in ((ROWS,), (1, STEPS), (ROWS, STEPS, 1)):
-        run.refuses("open_loop", *dataclasses.replace(drawn, is_first=np.zeros(shape, bool)).arguments)
+    for size in ((ROWS, STEPS, task.action_size - 1), (ROWS, STEPS - 1, task.action_size), (1, STEPS, task.action_size)):
+        run.refuses("open_loop", *dataclasses.replace(drawn, prev_action=np.zeros(size)).arguments)
+    for starts in (STARTS[:, 0], STARTS[:1], STARTS[..., None]):
+        run.refuses("open_loop", *dataclasses.replace(drawn, is_first=starts).arguments)
     for name, steps in (("posterior", CONTEXT), ("prior", STEPS - CONTEXT)):
         for shape in ((ROWS, steps + 1, config.stoch), (1, steps, config.stoch), (ROWS, steps, 1)):
             run.refuses("open_loop", *dataclasses.replace(drawn, noise=drawn.noise | {name: np.zeros(shape)}).arguments)
