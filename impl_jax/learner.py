@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from impl_jax import agent
+from impl_jax import agent, world_model
 from impl_jax.layers import compute_dtype, exact_dtype
 from spec import Config, Discrete, Spaces, parameter_table
 
@@ -38,6 +38,7 @@ class Learner:
         self._state = jax.device_put(state, self._device)
         self._policy = jax.jit(self._policy_function)
         self._train = jax.jit(self._train_function, donate_argnums=0)
+        self._predict = jax.jit(self._predict_function, static_argnums=4)
         self._batch_keys = (*spaces.observations, "reward", "is_first", "is_last", "is_terminal", "prev_action", "deter", "stoch")
 
     def initial_carry(self, envs: int) -> Any:
@@ -85,6 +86,16 @@ class Learner:
         self._state, metrics, latents = self._train(self._state, inputs, np.uint32(seed))
         return {name: _Element(metrics.values, index) for index, name in enumerate(metrics.names)}, latents
 
+    def predict(self, observation: Arrays, prev_action: np.ndarray, is_first: np.ndarray, context: int, seed: int) -> dict[str, np.ndarray]:
+        """The open-loop prediction of recorded sequences, with the random numbers of a seed. [WM-20] to [WM-24]
+
+        observation: key -> [B, T, ...]; prev_action [B, T, A]; is_first [B, T].
+        """
+        inputs = {key: np.asarray(observation[key]) for key in self.spaces.observations if key in observation}
+        inputs, prev_action, is_first = jax.device_put((inputs, np.asarray(prev_action), np.asarray(is_first, bool)), self._device)
+        predictions = self._predict(self._state["params"], inputs, prev_action, is_first, context, np.uint32(seed))
+        return {key: np.asarray(value) for key, value in predictions.items()}
+
     def state_dict(self) -> dict[str, np.ndarray]:
         """The training state under its canonical names. [AGT-8], [AGT-9]"""
         state = {name: np.array(value) for name, value in _flatten(self._state).items()}
@@ -127,6 +138,15 @@ class Learner:
         metrics = {f"loss/{name}": mean for name, mean in aux["losses"].items()} | aux["metrics"]
         values = jnp.stack([value.astype(exact_dtype(self.config)) for value in metrics.values()])
         return state, _Metrics(tuple(metrics), values), self._stored(aux)
+
+    def _predict_function(
+        self, params: Any, observation: Any, prev_action: jax.Array, is_first: jax.Array, context: int, seed: jax.Array
+    ) -> dict[str, jax.Array]:
+        (B, T), key = is_first.shape, jax.random.key(seed)
+        shapes = {"posterior": (B, max(0, context), self.config.stoch), "prior": (B, max(0, T - context), self.config.stoch)}
+        dtype = exact_dtype(self.config)
+        noise = {name: jax.random.uniform(jax.random.fold_in(key, i), shape, dtype) for i, (name, shape) in enumerate(shapes.items())}
+        return world_model.open_loop(params, observation, prev_action, is_first, context, noise, self.spaces, self.config)
 
     def _stored(self, states: Any) -> dict[str, jax.Array]:
         """Latents as the replay buffer keeps them."""

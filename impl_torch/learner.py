@@ -14,6 +14,7 @@ from impl_torch.optimizer import flat_optimizer, flat_step_
 from impl_torch.parameters import Layout, Parameters
 from impl_torch.rssm import freeze
 from impl_torch.shapes import compute_dtype, wide_dtype
+from impl_torch.world_model import open_loop
 from spec import Config, Discrete, Spaces, parameter_table
 
 Arrays = Mapping[str, np.ndarray]
@@ -131,6 +132,19 @@ class Learner:
             values = _to_host(torch.stack([value.double() for value in metrics.values()]))
             latents = {"deter": _to_host(aux["deter"].float()), "stoch": _to_host(aux["stoch"].argmax(-1))}
         return {name: _Element(values, index) for index, name in enumerate(metrics)}, latents
+
+    @torch.no_grad()
+    def predict(self, observation: Arrays, prev_action: np.ndarray, is_first: np.ndarray, context: int, seed: int) -> dict[str, np.ndarray]:
+        """The open-loop prediction of {key: [B, T, ...]}, prev_action [B, T, A], is_first [B, T], with the noise of a seed. [WM-20]"""
+        generator, (B, T) = self._generator(seed), np.shape(is_first)
+        noise = {
+            "posterior": self._uniform(generator, B, max(0, context), self.config.stoch),
+            "prior": self._uniform(generator, B, max(0, T - context), self.config.stoch),
+        }
+        inputs = {key: self._to_device(observation[key]) for key in self.spaces.observations if key in observation}
+        actions, starts = self._to_device(prev_action), self._to_device(is_first)
+        predictions = open_loop(self.parameters.mapping(), inputs, actions, starts, context, noise, self.spaces, self.config)
+        return {key: value.cpu().numpy() for key, value in predictions.items()}
 
     def state_dict(self) -> dict[str, np.ndarray]:
         """The training state under its canonical names, as copies. [AGT-8] [AGT-9]"""

@@ -47,6 +47,17 @@ class Learner(Protocol):
         """One gradient step on a replay batch. Returns scalar metrics by name and the latents to write back
         {"deter": [B, T, D], "stoch": [B, T, S] class indices}; both may still be computing when this returns."""
 
+    def predict(self, observation: Arrays, prev_action: np.ndarray, is_first: np.ndarray, context: int, seed: int) -> dict[str, np.ndarray]:
+        """The open-loop prediction of recorded sequences: [WM] open-loop prediction. Nothing in the learner changes.
+
+        observation: key -> [B, T, ...], of which `context` steps are seen; prev_action: [B, T, A], the action before each observation;
+        is_first: bool [B, T]. Returns by observation key [B, T, ...]: numbers in their own units, probabilities of a Discrete's classes
+        [B, T, sum of classes], images in [0, 1]; and "reward" and "continue_" [B, T].
+
+        Raises:
+          ValueError: a missing key, a wrong shape, or a context that is not within the sequence.
+        """
+
     def state_dict(self) -> dict[str, np.ndarray]:
         """The training state under its canonical names: [AGT-9]."""
 
