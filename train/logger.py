@@ -246,8 +246,8 @@ class Display:
     def phase(self, name: str, done: int = 0, total: int | None = None, unit: str = "") -> None:
         """Something beside training goes on; to be called as often as one likes, and before anything that takes long.
 
-        total: how much there is to do, in the unit; None if nobody knows, as with a compilation. Where there is no terminal, such a phase is
-        said when it begins, because nobody may call again before it is over.
+        total: how much there is to do, in the unit; None if nobody knows, as with a compilation. Where there is no terminal, such a phase
+        is said when it begins, because nobody may call again before it is over.
         """
         self._show(name, done, total, name if total is None else f"{name} {done:,}/{total:,} {unit}".rstrip())
 
