@@ -52,15 +52,16 @@ def write_about(
         "size": size,
         "parameters": parameters,
         "options": _options(options),
-        "hyperparameters": _plain(dataclasses.asdict(options.config)),
-        "changed_hyperparameters": _plain(changed),
+        "hyperparameters": dataclasses.asdict(options.config),
+        "changed_hyperparameters": changed,
         "spaces": spaces.to_json(),
         "preflight": dataclasses.asdict(preflight) if preflight else None,
         "machine": machine,
         "starts": [*(earlier["starts"] if earlier else []), start],
     }
-    _write(options.logdir / NAME, about)
-    return about
+    text = json.dumps(about, indent=1) + "\n"
+    _write(options.logdir / NAME, text)
+    return json.loads(text)
 
 
 def read_about(logdir: Path) -> About | None:
@@ -109,21 +110,17 @@ def _options(options: Options) -> dict[str, Any]:
     return {name: str(value) if isinstance(value, Path) else value for name, value in values.items()}
 
 
-def _plain(values: dict[str, Any]) -> dict[str, Any]:
-    return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
-
-
 def _show(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     return ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
 
 
-def _write(path: Path, about: About) -> None:
+def _write(path: Path, text: str) -> None:
     temporary = path.with_suffix(".tmp")
     try:
         with temporary.open("w", encoding="utf-8") as file:
-            file.write(json.dumps(about, indent=1) + "\n")
+            file.write(text)
             file.flush()
             os.fsync(file.fileno())
         temporary.replace(path)

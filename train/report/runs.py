@@ -13,8 +13,9 @@ from train.about import read_about
 from train.errors import UserError
 from train.logger import iterate_metrics
 
-# Of the options, beside task, backend and hyperparameters, those that change what is learned: runs that agree in all are seeds of one group.
+# Of the options, beside task, backend and hyperparameters, those that change what is learned: runs of one group agree in all of them.
 LEARNING_OPTIONS = ("action_repeat", "image_size", "replay_deter")
+LABELS = ("backend", "profile", "size", *LEARNING_OPTIONS)  # what may tell groups apart, beside hyperparameters that were changed
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,6 +80,13 @@ class Group:
     label: str
     color: int
     runs: list[RunLog]
+
+    @property
+    def size(self) -> str:
+        """3 seeds; or 3 runs, if they have not each a seed of its own."""
+        count, seeds = len(self.runs), {run.seed for run in self.runs}
+        what = "seed" if len(seeds) == count and None not in seeds else "run"
+        return f"{count} {what}{'' if count == 1 else 's'}"
 
 
 def find_logdirs(paths: Sequence[Path]) -> list[Path]:
@@ -208,35 +216,43 @@ def group_runs(runs: Sequence[RunLog]) -> dict[str, list[Group]]:
 
 def _identity(run: RunLog) -> str:
     """What runs of one group agree in; a run about which nothing is known agrees with no other."""
-    known = {name: run.options.get(name) for name in LEARNING_OPTIONS} | run.hyperparameters
-    return json.dumps([run.backend, known], sort_keys=True) if run.hyperparameters else str(run.logdir)
+    return json.dumps([run.backend, _of_learning(run), run.hyperparameters], sort_keys=True) if run.hyperparameters else str(run.logdir)
 
 
 def _label(groups: list[list[RunLog]]) -> list[Group]:
     """Names each group by what tells it from the others."""
     first = [group[0] for group in groups]
-    names = differing([settings(run) for run in first])
-    names = [name for name in names if name == "backend" or name in LEARNING_OPTIONS or any(name in run.hyperparameters for run in first)]
-    labels = []
-    for run in first:
+    changed = dict.fromkeys(name for run in first for name in run.changed)
+    names = differing([{name: value for name, value in settings(run).items() if name in (*LABELS, *changed)} for run in first])
+
+    def label(run: RunLog) -> str:
         words = [show(settings(run).get(name)) if name == "backend" else f"{name} {show(settings(run).get(name))}" for name in names]
-        labels.append(", ".join(words) if run.hyperparameters and words else run.backend or run.logdir.name)
+        return ", ".join(words) if run.hyperparameters and words else run.backend or run.logdir.name
+
+    labels = [label(run) for run in first]
     repeated = {label for label in labels if labels.count(label) > 1}
     labels = [f"{label} ({run.logdir.name})" if label in repeated else label for label, run in zip(labels, first, strict=True)]
     return [Group(label, color, group) for color, (label, group) in enumerate(zip(labels, groups, strict=True))]
+
+
+def _of_learning(run: RunLog) -> dict[str, Any]:
+    return {name: run.options.get(name) for name in LEARNING_OPTIONS}
 
 
 def settings(run: RunLog) -> dict[str, Any]:
     """Everything that was set, by name: task, backend, device, options and hyperparameters, but not where the logs are."""
     options = {name: value for name, value in run.options.items() if name not in ("logdir", "task", "backend", "device")}
     top = {"task": run.task, "backend": run.backend, "device": run.device, "profile": run.profile, "size": run.size}
-    return top | options | run.hyperparameters
+    return {name: value for name, value in top.items() if value} | options | run.hyperparameters
 
 
 def differing(configurations: Sequence[dict[str, Any]]) -> list[str]:
-    """The names whose values are not the same in all configurations."""
-    names = dict.fromkeys(name for configuration in configurations for name in configuration)
-    return [name for name in names if len({json.dumps(configuration.get(name), sort_keys=True) for configuration in configurations}) > 1]
+    """The names whose values are not the same in all configurations that have them."""
+    values: dict[str, set[str]] = {}
+    for configuration in configurations:
+        for name, value in configuration.items():
+            values.setdefault(name, set()).add(json.dumps(value, sort_keys=True))
+    return [name for name, found in values.items() if len(found) > 1]
 
 
 def show(value: Any) -> str:
