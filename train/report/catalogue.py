@@ -39,11 +39,9 @@ def _section(entries: dict) -> Section:
 
 def find(name: str) -> tuple[str, Metric] | None:
     """The section and the entry of a metric as it stands in metrics.jsonl; None if nobody has described it."""
-    for section, content in sections().items():
-        for metric in content.metrics:
-            if re.fullmatch(re.escape(metric.name).replace("<key>", ".+"), name):
-                return section, metric
-    return None
+    entries = ((section, metric) for section, content in sections().items() for metric in content.metrics)
+    found = [entry for entry in entries if re.fullmatch(re.escape(entry[1].name).replace("<key>", ".+"), name)]
+    return max(found, key=lambda entry: len(entry[1].name), default=None)  # <key>_context_error is not the <key>_error of a longer key
 
 
 def markdown() -> str:

@@ -62,7 +62,10 @@ def _over(bands: Sequence[Band], steps: np.ndarray, low: np.ndarray, high: np.nd
     if not len(steps):
         return Band(steps, steps, steps, steps, bad)
     middle = _columns(bands, [band.middle for band in bands], steps)
-    return Band(steps, np.nanmean(middle, 0), np.nanmin(low, 0), np.nanmax(high, 0), bad)
+    known = np.isfinite(middle).any(0)  # Between the end of one run and the beginning of another there is nothing.
+    with np.errstate(over="ignore"):
+        mean = np.nanmean(middle[:, known], 0)
+    return Band(steps[known], mean, np.nanmin(low[:, known], 0), np.nanmax(high[:, known], 0), bad)
 
 
 def _common_steps(bands: Sequence[Band], stretches: int) -> np.ndarray:
@@ -72,7 +75,7 @@ def _common_steps(bands: Sequence[Band], stretches: int) -> np.ndarray:
 
 
 def _columns(bands: Sequence[Band], values: Sequence[np.ndarray], steps: np.ndarray) -> np.ndarray:
-    """[runs, n]: what each run has at these steps, NaN before it begins and after it ends. Every step lies within some run."""
+    """[runs, n]: what each run has at these steps, NaN before it begins and after it ends."""
     rows = [
         np.interp(steps, band.steps, one, np.nan, np.nan) if len(band) else np.full(len(steps), np.nan)
         for band, one in zip(bands, values, strict=True)
