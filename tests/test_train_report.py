@@ -98,6 +98,12 @@ def test_a_shorter_run_counts_as_far_as_it_goes() -> None:
     assert dict(zip(band.steps.tolist(), band.middle.tolist(), strict=True)) == {0: 1, 10: 11, 20: 20}
 
 
+def test_a_run_that_ends_a_moment_earlier_counts_to_the_end() -> None:
+    """Or else the mean would jump to the other run at its last point."""
+    band = over_runs([curve([0, 50, 99], [1, 1, 1]), curve([0, 50, 100], [3, 3, 3])], 50, 100)
+    assert (band.steps[-1], band.middle.tolist()) == (100, [2, 2, 2, 2])
+
+
 def test_nothing_is_drawn_where_no_run_is() -> None:
     """Two runs, the second begins after the end of the first."""
     runs = [curve(list(range(0, 100)), [1] * 100), curve(list(range(1000, 1100)), [3] * 100)]
@@ -126,6 +132,7 @@ def test_ticks_are_round_numbers() -> None:
     assert svg.linear_ticks(0, 8000, 5) == [0, 2000, 4000, 6000, 8000]
     assert svg.linear_ticks(-0.11, 0.31, 4) == pytest.approx([-0.1, 0, 0.1, 0.2, 0.3])
     assert svg.log_ticks(2, 2000, 3) == [10, 100, 1000]
+    assert [svg.tick_format([], True)(value) for value in (1e-3, 0.1, 10, 1e4, 1e6)] == ["0.001", "0.1", "10", "10,000", "1e+06"]
 
 
 @pytest.mark.parametrize(
@@ -143,7 +150,7 @@ def test_numbers_at_axes(ticks: list[float], text: list[str]) -> None:
 
 
 def positions(chart: str) -> list[tuple[float, float]]:
-    [line] = re.findall(r'class="line[^"]*" data-label="[^"]*" d="M([^"]*)"', chart)
+    [line] = re.findall(r'class="line[^"]*" data-label="[^"]*" data-moved="0" d="M([^"]*)"', chart)
     return [tuple(map(float, point.split(","))) for point in line.split("L")]  # type: ignore[misc]
 
 
@@ -275,7 +282,7 @@ def test_headlines(tmp_path: Path) -> None:
     assert groups([evaluated])[0] == "100 <small>± 2</small>"
     value, lines = groups([evaluated], [{**evaluated, "evaluation/return": 300.0}])
     assert value == "200 <small>± 100</small>", "the error over seeds, not over episodes"
-    assert lines[0] == "return, last evaluation, mean over 2 seeds ± standard error over them"
+    assert lines[:2] == ["return, last evaluation, mean over 2 seeds", "± standard error over them"]
     value, lines = groups([{"step": step, "episode/return": float(step)} for step in range(1, 31)])
     assert (value, lines[0]) == ("20.5", "return, mean of the last 20 training episodes")
     assert groups([{"step": 1, "episode/return": NAN}])[0] == "no return yet"

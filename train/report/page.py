@@ -79,7 +79,8 @@ def _run(run: RunLog, is_open: bool) -> str:
     """Everything about one run that is not a number over time."""
     parts = [f'<p class="fail">{escape(note)}</p>' for note in run.notes]
     if run.command:
-        parts.append("<h3>Command to reproduce</h3>" + f"<pre>{escape(run.command)}</pre>")
+        words = " ".join(f"<span>{escape(word)}</span>" for word in run.command.split(" "))  # so that no line ends inside --an-option
+        parts.append(f"<h3>Command to reproduce</h3><pre>{words}</pre>")
     facts = {
         "log directory": str(run.logdir),
         "task": run.task,

@@ -50,7 +50,7 @@ def headline(group: Group) -> tuple[str, list[str]]:
             "standard error over them",
         )
     tail = "" if error is None else f" <small>± {error:.3g}</small>"
-    lines = [f"return, {about}" + (f" ± {spread}" if error is not None else "")]
+    lines = [f"return, {about}", *([f"± {spread}"] if error is not None else [])]
     random = [value for run in group.runs if (value := run.last("random/return")) is not None]
     if random:
         lines.append(f"a random policy gets {number(float(np.mean(random)))}")

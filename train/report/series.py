@@ -42,26 +42,25 @@ def means(curve: Curve, stretches: int, end: float) -> Band:
 def over_values(curves: Sequence[Curve], stretches: int, end: float) -> Band:
     """The mean of the runs' means in each stretch, between the lowest and the highest value of any run."""
     bands = [means(curve, stretches, end) for curve in curves]
-    steps = _common_steps(bands, stretches)
-    low = _columns(bands, [band.low for band in bands], steps)
-    high = _columns(bands, [band.high for band in bands], steps)
-    return _over(bands, steps, low, high)
+    steps, reach = _common_steps(bands, stretches), end / stretches
+    low = _columns(bands, [band.low for band in bands], steps, reach)
+    high = _columns(bands, [band.high for band in bands], steps, reach)
+    return _over(bands, steps, _columns(bands, [band.middle for band in bands], steps, reach), low, high)
 
 
 def over_runs(curves: Sequence[Curve], stretches: int, end: float) -> Band:
     """The mean of the runs' means in each stretch, between the lowest and the highest of these means."""
     bands = [means(curve, stretches, end) for curve in curves]
     steps = _common_steps(bands, stretches)
-    middle = _columns(bands, [band.middle for band in bands], steps)
-    return _over(bands, steps, middle, middle)
+    middle = _columns(bands, [band.middle for band in bands], steps, end / stretches)
+    return _over(bands, steps, middle, middle, middle)
 
 
-def _over(bands: Sequence[Band], steps: np.ndarray, low: np.ndarray, high: np.ndarray) -> Band:
-    """The mean over runs of their middles, between the lowest of `low` and the highest of `high`, both [runs, n]."""
+def _over(bands: Sequence[Band], steps: np.ndarray, middle: np.ndarray, low: np.ndarray, high: np.ndarray) -> Band:
+    """The mean over runs of `middle`, between the lowest of `low` and the highest of `high`, all [runs, n]."""
     bad = np.unique(np.concatenate([band.bad for band in bands]))
     if not len(steps):
         return Band(steps, steps, steps, steps, bad)
-    middle = _columns(bands, [band.middle for band in bands], steps)
     known = np.isfinite(middle).any(0)  # Between the end of one run and the beginning of another there is nothing.
     with np.errstate(over="ignore"):
         mean = np.nanmean(middle[:, known], 0)
@@ -74,13 +73,14 @@ def _common_steps(bands: Sequence[Band], stretches: int) -> np.ndarray:
     return np.linspace(steps[0], steps[-1], stretches) if len(bands) > 1 and len(steps) > stretches > 1 else steps
 
 
-def _columns(bands: Sequence[Band], values: Sequence[np.ndarray], steps: np.ndarray) -> np.ndarray:
-    """[runs, n]: what each run has at these steps, NaN before it begins and after it ends."""
-    rows = [
-        np.interp(steps, band.steps, one, np.nan, np.nan) if len(band) else np.full(len(steps), np.nan)
-        for band, one in zip(bands, values, strict=True)
-    ]
-    return np.array(rows)
+def _columns(bands: Sequence[Band], values: Sequence[np.ndarray], steps: np.ndarray, reach: float) -> np.ndarray:
+    """[runs, n]: what each run has at these steps, NaN further than `reach` before it begins or after it ends."""
+    rows = np.full((len(bands), len(steps)), np.nan)
+    for row, band, one in zip(rows, bands, values, strict=True):
+        if len(band):
+            near = (steps >= band.steps[0] - reach) & (steps <= band.steps[-1] + reach)
+            row[near] = np.interp(steps[near], band.steps, one)
+    return rows
 
 
 def thinned(curve: Curve) -> Curve:

@@ -17,7 +17,8 @@ p { margin: .3rem 0 .8rem; max-width: 46rem; }
 .muted, figcaption, dt { color: var(--muted); }
 .small, figcaption { font-size: .85rem; }
 code, pre, .mono { font-family: ui-monospace, "SF Mono", Menlo, Consolas, "DejaVu Sans Mono", monospace; font-size: .9em; }
-pre { white-space: pre-wrap; overflow-wrap: anywhere; background: var(--card); padding: .6rem .8rem; border-radius: 6px;
+pre span { white-space: pre; }
+pre { white-space: pre-wrap; overflow-x: auto; background: var(--card); padding: .6rem .8rem; border-radius: 6px;
   margin: .3rem 0 .8rem; }
 .cards { display: flex; flex-wrap: wrap; gap: .8rem; margin: 1rem 0; }
 .card { background: var(--card); border-radius: 8px; padding: .7rem 1rem; border-left: 4px solid var(--rule);
@@ -71,7 +72,10 @@ for (const svg of document.querySelectorAll("svg[data-axes]")) {
   const value = y => log ? low * Math.exp((y - y0) / (y1 - y0) * Math.log(high / low)) : low + (y - y0) / (y1 - y0) * (high - low);
   const lines = [...svg.querySelectorAll(".line")].map(line => ({
     label: line.dataset.label, color: [...line.classList].find(name => /^c\\d$/.test(name)),
-    points: line.getAttribute("d").slice(1).split("L").map(point => point.split(",").map(Number)) }));
+    points: line.getAttribute("d").slice(1).split("L").map(point => {
+      const [x, y] = point.split(",").map(Number);
+      return [x - line.dataset.moved, y];
+    }) }));
   if (!lines.length) continue;
   const cursor = document.createElementNS("http://www.w3.org/2000/svg", "path");
   const tip = document.createElement("div");
@@ -80,13 +84,15 @@ for (const svg of document.querySelectorAll("svg[data-axes]")) {
   svg.addEventListener("pointerleave", () => { tip.hidden = true; cursor.removeAttribute("d"); });
   svg.addEventListener("pointermove", event => {
     const box = svg.getBoundingClientRect();
-    const x = Math.min(x1, Math.max(x0, (event.clientX - box.left) / box.width * svg.viewBox.baseVal.width));
+    const pointer = (event.clientX - box.left) / box.width * svg.viewBox.baseVal.width;
+    const nearest = (points, x) => points.reduce((best, point) => Math.abs(point[0] - x) < Math.abs(best[0] - x) ? point : best);
+    const x = nearest(lines.flatMap(line => line.points), pointer)[0];
     cursor.setAttribute("d", `M${x},${Math.min(y0, y1)}V${Math.max(y0, y1)}`);
-    const step = Math.round((x - x0) / (x1 - x0) * end);
+    const step = Math.round(Math.round((x - x0) / (x1 - x0) * 1000) / 1000 * end);
     tip.replaceChildren(`step ${step.toLocaleString("en")}`);
     for (const { label, color, points } of lines) {
-      const near = points.reduce((best, point) => Math.abs(point[0] - x) < Math.abs(best[0] - x) ? point : best);
-      if (Math.abs(near[0] - x) > 30) continue;
+      const near = nearest(points, x);
+      if (Math.abs(near[0] - x) > 20) continue;
       const row = document.createElement("div"), swatch = document.createElement("span");
       swatch.className = `swatch ${color}`;
       row.append(swatch, `${label}: ${value(near[1]).toLocaleString("en", { maximumSignificantDigits: 3 })}`);

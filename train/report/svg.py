@@ -40,7 +40,7 @@ class Frame:
     bottom: int = 24
 
 
-LARGE, SMALL = Frame(460, 270, bottom=38), Frame(300, 150)
+LARGE, SMALL = Frame(420, 250, bottom=38), Frame(300, 150)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,8 +85,8 @@ def line_chart(
     parts += [_points(curve, one.color, x, y) for one in series for curve in one.points]
     parts += [_band(one, x, y) for one in series if not one.dots]
     for index, one in enumerate(series):
-        beside = x.moved(4.0 * (index - (len(series) - 1) / 2)) if one.dots else x  # so that whiskers do not hide each other
-        parts += [_whiskers(one, beside, y) if one.dots else "", _line(one, beside, y)]
+        by = 4.0 * (index - (len(series) - 1) / 2) if one.dots else 0.0  # so that whiskers do not hide each other
+        parts += [_whiskers(one, x.moved(by), y) if one.dots else "", _line(one, x.moved(by), y, by)]
     bad = np.unique(np.concatenate([one.band.bad for one in series])) if series else np.empty(0)
     parts += [_bad(step, x, frame) for step in bad[np.linspace(0, len(bad) - 1, min(len(bad), MOST_MARKS)).astype(int)]]
     return svg(frame, label, parts, x, y)
@@ -166,12 +166,12 @@ def _whiskers(series: Series, x: Axis, y: Axis) -> str:
     return f'<path class="whisker c{series.color % COLORS}" d="{lines}"/>' if lines else ""
 
 
-def _line(series: Series, x: Axis, y: Axis) -> str:
+def _line(series: Series, x: Axis, y: Axis, moved: float) -> str:
     if not len(series.band):
         return ""
     across, up = x(series.band.steps), y(series.band.middle)
     color = f"c{series.color % COLORS}" + (" dashed" if series.color >= COLORS else "")
-    parts = [f'<path class="line {color}" data-label="{escape(series.label)}" d="{path(across, up)}"/>']
+    parts = [f'<path class="line {color}" data-label="{escape(series.label)}" data-moved="{moved:g}" d="{path(across, up)}"/>']
     if series.dots or len(across) == 1:
         parts += [f'<circle class="{color}" cx="{a:.1f}" cy="{b:.1f}" r="3"/>' for a, b in zip(across, up, strict=True)]
     return "".join(parts)
@@ -227,7 +227,7 @@ def tick_format(ticks: Sequence[float], log: bool) -> Callable[[float], str]:
     largest = max((abs(value) for value in ticks), default=0.0)
     step = min((b - a for a, b in itertools.pairwise(ticks)), default=1.0)
     if log or not 1e-4 <= largest < 1e12:
-        return lambda value: f"{value:.3g}"
+        return lambda value: f"{value:,.0f}" if 1 <= value < 1e5 else f"{value:.3g}"
     for size, suffix in ((1e9, "G"), (1e6, "M"), (1e4, "k")):
         if largest >= size:
             unit = max(size, 1e3) if suffix != "k" else 1e3
