@@ -195,8 +195,8 @@ def _signals(spaces: Spaces, truth: Sequences, predicted: Mapping[str, np.ndarra
 def _draw_signals(signals: list[Signal], is_first: np.ndarray, context: int, title: str) -> Figure:
     """A page of small plots of one sequence: those that vary most, in their order."""
     shown = sorted(sorted(range(len(signals)), key=lambda index: -signals[index].spread)[:MOST_SIGNALS])
-    columns = min(4, len(shown))
-    rows = math.ceil(len(shown) / columns)
+    rows = math.ceil(len(shown) / 4)
+    columns = math.ceil(len(shown) / rows)
     figure = Figure(figsize=(max(5.0, 2.75 * columns), 1.55 * rows + 0.75), dpi=150, layout="constrained")
     grid = figure.subplots(rows, columns, sharex=True, squeeze=False)
     for place, (axes, index) in enumerate(zip(grid.flat, shown, strict=False)):
