@@ -136,9 +136,7 @@ class Learner:
     def _gradients_function(self, state: Any, batch: Any, seed: jax.Array) -> tuple[Any, dict[str, jax.Array]]:
         return_range = (state["return_range"]["low"], state["return_range"]["high"])
         noise = self._train_noise(batch, seed)
-        gradients, total, aux = agent.gradients(
-            state["params"], state["slow_critic"], return_range, batch, noise, self.spaces, self.config
-        )
+        gradients, total, aux = agent.gradients(state["params"], state["slow_critic"], return_range, batch, noise, self.spaces, self.config)
         low, high = aux["return_range"]
         metrics = {f"loss/{name}": mean for name, mean in aux["losses"].items()} | aux["metrics"]
         metrics |= {"loss/total": total, "return_low": low, "return_high": high}

@@ -53,14 +53,16 @@ class Prefetcher:
         self._drawn = self._draw(self.step)
         return batch
 
-    def write_back(self, ids: Any, latents: Mapping[str, Any]) -> None:
+    def write_back(self, ids: Any, latents: Mapping[str, Any], skipped: Any = 0.0) -> None:
         """Hands over the latents of the train step whose batch was taken last. Does not wait for them: they may still be computed.
+
+        skipped: the metric of that train step, which may still be computed too. The buffer stays as it is where it is 1: [LOOP-43].
 
         Raises:
           whatever the write-back before has raised.
         """
         self._settle_write_back()
-        self._written = self._thread.submit(self._write_back, ids, dict(latents))
+        self._written = self._thread.submit(self._write_back, ids, dict(latents), skipped)
 
     def pack(self, steps: Mapping[str, Any]) -> Packed:
         """See Replay.pack."""
@@ -107,8 +109,9 @@ class Prefetcher:
     def _draw(self, step: int) -> "concurrent.futures.Future[Batch]":
         return self._thread.submit(lambda: self.replay.sample(self._uniform(step)))
 
-    def _write_back(self, ids: Any, latents: Mapping[str, Any]) -> None:
-        self.replay.write_back(ids, {name: np.asarray(value) for name, value in latents.items()})
+    def _write_back(self, ids: Any, latents: Mapping[str, Any], skipped: Any) -> None:
+        if not float(skipped):
+            self.replay.write_back(ids, {name: np.asarray(value) for name, value in latents.items()})
 
     def _settle_draw(self) -> None:
         if self._drawn is not None:
