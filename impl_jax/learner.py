@@ -70,7 +70,9 @@ class Learner:
         Returns metrics by name and the latents to write back, which may still be computing.
         """
         inputs = self._inputs(batch)
-        self._state, self._stopped, metrics, latents = self._train(self._state, self._stopped, inputs, np.uint32(seed))
+        self._state, skipped, metrics, latents = self._train(self._state, self._stopped, inputs, np.uint32(seed))
+        if self._nonfinite == "stop":
+            self._stopped = skipped
         return {name: _Element(metrics.values, index) for index, name in enumerate(metrics.names)}, latents
 
     def gradients(self, batch: Arrays, seed: int) -> tuple[dict[str, float], dict[str, np.ndarray]]:
@@ -128,10 +130,8 @@ class Learner:
         finite = jnp.isfinite(metrics["loss/total"]) & jnp.isfinite(metrics["gradient_norm"])
         applied = finite & ~stopped
         state = jax.tree.map(lambda after, before: jnp.where(applied, after, before), new, state)
-        if self._nonfinite == "stop":
-            stopped = ~applied
         metrics |= {"update_norm": jnp.where(applied, metrics["update_norm"], 0.0), "skipped": ~applied}
-        return state, stopped, self._packed(metrics), self._stored(aux)
+        return state, ~applied, self._packed(metrics), self._stored(aux)
 
     def _gradients_function(self, state: Any, batch: Any, seed: jax.Array) -> tuple[Any, dict[str, jax.Array]]:
         return_range = (state["return_range"]["low"], state["return_range"]["high"])
