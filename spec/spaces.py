@@ -142,7 +142,7 @@ class Spaces:
           ValueError: anything that `to_json` does not write.
         """
         match description:
-            case {"observations": {**observations}, "actions": {**actions}}:
+            case {"observations": dict(observations), "actions": dict(actions)}:
                 return cls(
                     {key: _from_json(f"observation {key!r}", entry, _OBSERVED) for key, entry in observations.items()},
                     {key: _from_json(f"action {key!r}", entry, _CHOSEN) for key, entry in actions.items()},

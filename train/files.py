@@ -8,7 +8,6 @@ file, whatever the file says.
 import collections
 import hashlib
 import json
-import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -72,8 +71,7 @@ def read_json(path: Path) -> dict[str, Any]:
     """A JSON object.
 
     Raises:
-      ValueError: not JSON or not an object, a name twice in one object, a number that is not finite or has more than 64 bits, too deep,
-        too long.
+      ValueError: not JSON or not an object, a name twice in one object, a whole number of more than 64 bits, too deep, too long.
       OSError: it cannot be read.
     """
     return _parse_json(read_text(path), path.name)
@@ -131,7 +129,7 @@ def _check_header(path: Path) -> None:
 
 def _parse_json(text: str, name: str) -> dict[str, Any]:
     try:
-        value = json.loads(text, object_pairs_hook=_no_name_twice, parse_int=_int64, parse_float=_finite, parse_constant=_finite)
+        value = json.loads(text, object_pairs_hook=_no_name_twice, parse_int=_int64)
         json.dumps(value, ensure_ascii=False).encode("utf-8")  # Half a surrogate pair could not be printed.
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{name}: {error}") from error
@@ -152,13 +150,6 @@ def _int64(text: str) -> int:
     value = int(text)
     if not -(2**63) <= value < 2**63:
         raise ValueError(f"{text:.40} is not a number of 64 bits")
-    return value
-
-
-def _finite(text: str) -> float:
-    value = float(text)
-    if not math.isfinite(value):
-        raise ValueError(f"{text} is not a finite number")
     return value
 
 

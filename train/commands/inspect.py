@@ -158,6 +158,8 @@ def rerun(incident: Incident, device: str | None) -> tuple[bool, str]:
     """
     info = incident.info
     try:
+        if info["backend"] not in ("jax", "torch"):  # A file does not choose which module is imported.
+            raise ValueError(f"unknown backend {info['backend']!r:.80}")
         spaces = Spaces.from_json(info["spaces"])
         config = load_config("paper", "tiny", **{name: info["identity"][name] for name in hyperparameters()})
         expected = {f"params/{name}": entry.shape for name, entry in parameter_table(config, spaces).items()}
@@ -168,14 +170,16 @@ def rerun(incident: Incident, device: str | None) -> tuple[bool, str]:
         learner.load_state_dict(incident.state)
         metrics, gradients = learner.gradients(incident.batch, info["seed"])
     except ModuleNotFoundError as error:
-        raise UserError(f"the backend {info['backend']} cannot be loaded: there is no module {error.name}") from error
+        raise UserError(
+            f"the backend {info['backend']} needs the package {error.name}: pip install 'dreamer-spec[{info['backend']}]'"
+        ) from error
     except (ValueError, KeyError) as error:
         raise UserError(f"the incident {incident.path} cannot be repeated: {error}") from error
     before = {*nonfinite(incident.repeated), *(one.name for one in incident.tallies if one.kind == "gradient")}
     now = {*nonfinite(metrics), *(one.name for one in offending("gradient", gradients))}
     if now == before:
         return True, f"{learner.device}: the same {len(now)} metrics and gradients are not finite"
-    words = f"only before: {_listed(sorted(before - now)) or 'none'}; only now: {_listed(sorted(now - before)) or 'none'}"
+    words = f"Only before: {_listed(sorted(before - now)) or 'none'}; only now: {_listed(sorted(now - before)) or 'none'}"
     return False, f"{learner.device}: other metrics and gradients are not finite. {words}"
 
 
