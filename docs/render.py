@@ -75,10 +75,10 @@ def benchmark_table() -> str:
 
 
 def conformance_runs() -> dict[tuple[str, str, str], dict[str, Any]]:
-    """The committed runs of the kit: (backend, dtype, profile) -> report of `conformance run --json`."""
+    """The committed runs of the kit: (candidate, dtype, profile) -> report of `conformance check --json`."""
     reports = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(RESULTS.glob("conformance-*.json"))]
     order = ("jax", "torch", "float64", "float32", "bfloat16", "paper", "official")
-    keyed = {(report["backend"], report["dtype"], report["profile"]): report for report in reports}
+    keyed = {(report["candidate"], report["dtype"], report["profile"]): report for report in reports}
     return dict(sorted(keyed.items(), key=lambda item: tuple(map(order.index, item[0]))))
 
 

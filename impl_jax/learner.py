@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from impl_jax import agent
+from impl_jax import agent, world_model
 from impl_jax.checks import require
 from impl_jax.layers import compute_dtype, exact_dtype
 from impl_jax.optimizer import norm
@@ -43,6 +43,7 @@ class Learner:
         self._policy = jax.jit(self._policy_function)
         self._train = jax.jit(self._train_function, donate_argnums=0)
         self._gradients = jax.jit(self._gradients_function)
+        self._predict = jax.jit(self._predict_function, static_argnums=4)
         self._batch_keys = (*spaces.observations, "reward", "is_first", "is_last", "is_terminal", "prev_action", "deter", "stoch")
 
     def initial_carry(self, envs: int) -> Any:
@@ -52,6 +53,20 @@ class Learner:
         carry = {key: jnp.zeros(shape, dtype) for key, shape in shapes.items()}
         carry["action"] = jnp.zeros((envs, self.spaces.action_size), exact_dtype(config))
         return jax.device_put(carry, self._device)
+
+    def save_carry(self, carry: Any) -> dict[str, np.ndarray]:
+        """A carry as arrays, exactly: what is bfloat16 becomes float32."""
+        return {key: np.asarray(value.astype(jnp.float32) if value.dtype == jnp.bfloat16 else value) for key, value in carry.items()}
+
+    def load_carry(self, arrays: Arrays) -> Any:
+        """The inverse of `save_carry`. [CON-5]"""
+        zeros = self.initial_carry(len(arrays["action"]))
+        return jax.device_put({key: jnp.asarray(arrays[key], value.dtype) for key, value in zeros.items()}, self._device)
+
+    def memory(self) -> int | None:
+        """Bytes in use on the accelerator; None without one."""
+        statistics = None if self._device.platform == "cpu" else self._device.memory_stats()
+        return statistics and statistics.get("bytes_in_use")
 
     def policy(self, observation: Arrays, is_first: np.ndarray, carry: Any, seed: int) -> tuple[np.ndarray, Arrays, Any]:
         """One acting step of N environments. [AGT-11]
@@ -80,6 +95,16 @@ class Learner:
         metrics, gradients = self._gradients(self._state, self._inputs(batch), np.uint32(seed))
         numbers = dict(zip(metrics.names, np.asarray(metrics.values).tolist(), strict=True))
         return numbers, {name: np.array(gradient) for name, gradient in gradients.items()}
+
+    def predict(self, observation: Arrays, prev_action: np.ndarray, is_first: np.ndarray, context: int, seed: int) -> dict[str, np.ndarray]:
+        """The open-loop prediction of recorded sequences, with the random numbers of a seed. [WM-20] to [WM-24]
+
+        observation: key -> [B, T, ...]; prev_action [B, T, A]; is_first [B, T].
+        """
+        inputs = {key: np.asarray(observation[key]) for key in self.spaces.observations if key in observation}
+        inputs, prev_action, is_first = jax.device_put((inputs, np.asarray(prev_action), np.asarray(is_first, bool)), self._device)
+        predictions = self._predict(self._state["params"], inputs, prev_action, is_first, context, np.uint32(seed))
+        return {key: np.asarray(value) for key, value in predictions.items()}
 
     def state_dict(self) -> dict[str, np.ndarray]:
         """The training state under its canonical names. [AGT-8], [AGT-9]"""
@@ -152,6 +177,15 @@ class Learner:
 
     def _packed(self, metrics: Mapping[str, jax.Array]) -> "_Metrics":
         return _Metrics(tuple(metrics), jnp.stack([value.astype(exact_dtype(self.config)) for value in metrics.values()]))
+
+    def _predict_function(
+        self, params: Any, observation: Any, prev_action: jax.Array, is_first: jax.Array, context: int, seed: jax.Array
+    ) -> dict[str, jax.Array]:
+        (B, T), key = is_first.shape, jax.random.key(seed)
+        shapes = {"posterior": (B, max(0, context), self.config.stoch), "prior": (B, max(0, T - context), self.config.stoch)}
+        dtype = exact_dtype(self.config)
+        noise = {name: jax.random.uniform(jax.random.fold_in(key, i), shape, dtype) for i, (name, shape) in enumerate(shapes.items())}
+        return world_model.open_loop(params, observation, prev_action, is_first, context, noise, self.spaces, self.config)
 
     def _stored(self, states: Any) -> dict[str, jax.Array]:
         """Latents as the replay buffer keeps them."""

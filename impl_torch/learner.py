@@ -14,6 +14,7 @@ from impl_torch.optimizer import clip_flat_gradients_, flat_optimizer, flat_step
 from impl_torch.parameters import Layout, Parameters
 from impl_torch.rssm import freeze
 from impl_torch.shapes import compute_dtype, expect, wide_dtype
+from impl_torch.world_model import open_loop
 from spec import Config, Discrete, Spaces, parameter_table
 
 Arrays = Mapping[str, np.ndarray]
@@ -65,8 +66,22 @@ class Learner:
     def initial_carry(self, envs: int) -> dict[str, Tensor]:
         """All zeros: {"deter" [N, D], "stoch" [N, S, C], "action" [N, A]}. [CON-5]"""
         c = self.config
-        shapes = {"deter": (c.deter,), "stoch": (c.stoch, c.classes), "action": (self.spaces.action_size,)}
-        return {name: torch.zeros(envs, *shape, dtype=compute_dtype(c), device=self._device) for name, shape in shapes.items()}
+        shapes = {"deter": (c.deter,), "stoch": (c.stoch, c.classes)}
+        carry = {name: torch.zeros(envs, *shape, dtype=compute_dtype(c), device=self._device) for name, shape in shapes.items()}
+        return carry | {"action": torch.zeros(envs, self.spaces.action_size, dtype=self._dtype, device=self._device)}
+
+    def save_carry(self, carry: Mapping[str, Tensor]) -> dict[str, np.ndarray]:
+        """A carry as arrays, exactly: what is bfloat16 becomes float32."""
+        return {name: (x.float() if x.dtype == torch.bfloat16 else x).numpy(force=True) for name, x in carry.items()}
+
+    def load_carry(self, arrays: Arrays) -> dict[str, Tensor]:
+        """The inverse of `save_carry`. [CON-5]"""
+        zeros = self.initial_carry(len(arrays["action"]))
+        return {name: torch.tensor(arrays[name]).to(x) for name, x in zeros.items()}
+
+    def memory(self) -> int | None:
+        """Bytes in use on the accelerator; None without one."""
+        return torch.cuda.memory_allocated(self._device) if self._device.type == "cuda" else None
 
     @torch.no_grad()
     def policy(
@@ -116,6 +131,19 @@ class Learner:
         """The metrics and the gradient of every parameter that a train step would compute now. Changes nothing. [LOOP-44]"""
         by_name, metrics, _, _ = self._differentiate(batch, seed)
         return {name: float(x) for name, x in metrics.items()}, {name: x.cpu().numpy().copy() for name, x in by_name.items()}
+
+    @torch.no_grad()
+    def predict(self, observation: Arrays, prev_action: np.ndarray, is_first: np.ndarray, context: int, seed: int) -> dict[str, np.ndarray]:
+        """The open-loop prediction of {key: [B, T, ...]}, prev_action [B, T, A], is_first [B, T], with the noise of a seed. [WM-20]"""
+        generator, (B, T) = self._generator(seed), np.shape(is_first)
+        noise = {
+            "posterior": self._uniform(generator, B, max(0, context), self.config.stoch),
+            "prior": self._uniform(generator, B, max(0, T - context), self.config.stoch),
+        }
+        inputs = {key: self._to_device(observation[key]) for key in self.spaces.observations if key in observation}
+        actions, starts = self._to_device(prev_action), self._to_device(is_first)
+        predictions = open_loop(self.parameters.mapping(), inputs, actions, starts, context, noise, self.spaces, self.config)
+        return {key: value.cpu().numpy() for key, value in predictions.items()}
 
     def state_dict(self) -> dict[str, np.ndarray]:
         """The training state under its canonical names, as copies. [AGT-8] [AGT-9]"""

@@ -141,7 +141,7 @@ class FakeLearner:
     seeds: ClassVar[list[tuple[str, int]]] = []
     loss: ClassVar[float] = 1.0
 
-    def __init__(self, spaces: Spaces, config: Config, *, seed: int, device: str | None = None) -> None:
+    def __init__(self, spaces: Spaces, config: Config, *, seed: int, device: str | None = None, nonfinite: str = "stop") -> None:
         if device not in (None, "cpu"):
             raise ValueError(f"no device {device!r}; available: cpu")
         self.device = "cpu"
@@ -151,6 +151,15 @@ class FakeLearner:
 
     def initial_carry(self, envs: int) -> Any:
         return np.zeros(envs, int)
+
+    def save_carry(self, carry: Any) -> dict[str, np.ndarray]:
+        return {"steps": carry}
+
+    def load_carry(self, arrays: Mapping[str, np.ndarray]) -> Any:
+        return arrays["steps"]
+
+    def memory(self) -> int | None:
+        return None
 
     def policy(
         self, observation: Mapping[str, np.ndarray], is_first: np.ndarray, carry: Any, seed: int

@@ -30,6 +30,15 @@ class Learner(Protocol):
     def initial_carry(self, envs: int) -> Any:
         """The carry of `envs` environments before their first step; opaque to the caller."""
 
+    def save_carry(self, carry: Any) -> dict[str, np.ndarray]:
+        """A carry as arrays, exactly: what is bfloat16 becomes float32."""
+
+    def load_carry(self, arrays: Arrays) -> Any:
+        """The inverse of `save_carry`, of this backend's or of another's carry."""
+
+    def memory(self) -> int | None:
+        """Bytes in use on the accelerator; None without one."""
+
     def policy(self, observation: Arrays, is_first: np.ndarray, carry: Any, seed: int) -> tuple[np.ndarray, Arrays, Any]:
         """One acting step of N environments: [AGT] policy step.
 
@@ -49,6 +58,17 @@ class Learner(Protocol):
         """What `train_step` would compute now up to the gradients, with the same noise: metrics and gradients by canonical names.
 
         Changes nothing, and does so after a stop as well.
+        """
+
+    def predict(self, observation: Arrays, prev_action: np.ndarray, is_first: np.ndarray, context: int, seed: int) -> dict[str, np.ndarray]:
+        """The open-loop prediction of recorded sequences: [WM] open-loop prediction. Nothing in the learner changes.
+
+        observation: key -> [B, T, ...], of which `context` steps are seen; prev_action: [B, T, A], the action before each observation;
+        is_first: bool [B, T]. Returns by observation key [B, T, ...]: numbers in their own units, probabilities of a Discrete's classes
+        [B, T, sum of classes], images in [0, 1]; and "reward" and "continue_" [B, T].
+
+        Raises:
+          ValueError: a missing key, a wrong shape, or a context that is not within the sequence.
         """
 
     def state_dict(self) -> dict[str, np.ndarray]:

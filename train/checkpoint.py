@@ -2,11 +2,13 @@
 
 LOGDIR/checkpoints/<environment step>/
   learner.safetensors   the training state under its canonical names (spec/10-agent.md): either backend reads it
-  drawn.safetensors     the batch that was drawn ahead
+  loop.safetensors      what the loop held: the batch drawn ahead, the records of the moment, carries, actions of the episodes under way
   run.json              configuration, spaces, counters, and which state of LOGDIR/replay belongs to it: [LOOP-21]
+  SHA256SUMS            checksums of the other files, which `sha256sum --check` reads too
 """
 
 import dataclasses
+import hashlib
 import json
 import os
 import re
@@ -21,15 +23,21 @@ from safetensors.numpy import load_file, save_file
 
 from train.errors import UserError
 
-FORMAT = 2
+FORMAT = 3
 OURS = re.compile(r"\d{12}(\.tmp|\.old)?")  # .tmp: being written; .old: about to be replaced by the same step
+FILES = ("learner.safetensors", "loop.safetensors", "run.json")
+SUMS = "SHA256SUMS"
 
 Arrays = dict[str, np.ndarray]
 
 
+class Damaged(UserError):
+    """A checkpoint whose files are not those that were written."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Checkpoint:
-    """info: format, identity (train.options.Options.identity), backend, spaces, counters, replay_ratio, random_return, evaluation."""
+    """info: format, identity (train.options.Options.identity), backend, spaces, counters, and what else train/resume.py puts there."""
 
     path: Path
     info: dict[str, Any]
@@ -39,8 +47,8 @@ class Checkpoint:
         return _read_arrays(self.path / "learner.safetensors")
 
     @property
-    def drawn(self) -> Arrays:
-        return _read_arrays(self.path / "drawn.safetensors")
+    def loop(self) -> Arrays:
+        return _read_arrays(self.path / "loop.safetensors")
 
 
 def name_of(step: int) -> str:
@@ -48,8 +56,8 @@ def name_of(step: int) -> str:
     return f"{step:012d}"
 
 
-def save(logdir: Path, step: int, learner: Mapping[str, Any], drawn: Mapping[str, Any], info: Mapping[str, Any]) -> Path:
-    """Writes a checkpoint under another name, renames it, then removes the older ones. [LOOP-22]
+def save(logdir: Path, step: int, learner: Mapping[str, Any], loop: Mapping[str, Any], info: Mapping[str, Any], keep: int) -> Path:
+    """Writes a checkpoint under another name, renames it, then removes all but the newest `keep`. [LOOP-22]
 
     Raises:
       UserError: the disk refuses it.
@@ -60,38 +68,66 @@ def save(logdir: Path, step: int, learner: Mapping[str, Any], drawn: Mapping[str
         shutil.rmtree(temporary, ignore_errors=True)
         temporary.mkdir(parents=True)
         save_file(_contiguous(_single_precision(learner)), temporary / "learner.safetensors")
-        save_file(_contiguous(drawn), temporary / "drawn.safetensors")
+        save_file(_contiguous(loop), temporary / "loop.safetensors")
         (temporary / "run.json").write_text(json.dumps({"format": FORMAT, **info}, indent=2) + "\n", encoding="utf-8")
-        for file in temporary.iterdir():
-            _flush_to_disk(file)
+        sums = "".join(f"{_sha256(temporary / name)}  {name}\n" for name in FILES)
+        (temporary / SUMS).write_text(sums, encoding="ascii")
+        for path in (*temporary.iterdir(), temporary):
+            _flush_to_disk(path)
         if final.exists():  # The same step again, as before and after the last evaluation.
             final.rename(directory / f"{name_of(step)}.old")
         temporary.rename(final)
+        _flush_to_disk(directory)
+        kept = [path for path in candidates(logdir) if path.suffix == ""][:keep]
         for other in directory.iterdir():
-            if other != final and OURS.fullmatch(other.name):
+            if other not in kept and OURS.fullmatch(other.name):
                 shutil.rmtree(other)
     except (OSError, SafetensorError) as error:
         raise UserError(f"cannot write the checkpoint {final}: {error}") from error
     return final
 
 
-def find(logdir: Path) -> Checkpoint | None:
-    """The newest checkpoint of a log directory, or None.
+def candidates(logdir: Path) -> list[Path]:
+    """The checkpoints of a log directory that were once complete, the newest first."""
+    found = (path for path in (logdir / "checkpoints").glob("*") if OURS.fullmatch(path.name) and path.suffix != ".tmp")
+    return sorted(found, key=lambda path: (path.stem, path.suffix == ""), reverse=True)
+
+
+def set_aside(checkpoint: Path) -> Path:
+    """Renames a damaged checkpoint, so that it is neither used nor removed. Returns its new path.
 
     Raises:
-      UserError: a checkpoint that cannot be read, or of another format.
+      UserError: the disk refuses it.
     """
-    found = (path for path in (logdir / "checkpoints").glob("*") if OURS.fullmatch(path.name) and path.suffix != ".tmp")
-    paths = sorted(found, key=lambda path: (path.stem, path.suffix == ""))
-    if not paths:
-        return None
+    aside = checkpoint.with_name(f"{checkpoint.name}.damaged")
     try:
-        info = json.loads((paths[-1] / "run.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise UserError(f"the checkpoint {paths[-1]} is damaged: {error}") from error
-    if info.get("format") != FORMAT:
-        raise UserError(f"the checkpoint {paths[-1]} has format {info.get('format')}; this version reads format {FORMAT}")
-    return Checkpoint(paths[-1], info)
+        shutil.rmtree(aside, ignore_errors=True)
+        return checkpoint.rename(aside)
+    except OSError as error:
+        raise UserError(f"cannot rename the damaged checkpoint {checkpoint}: {error.strerror}; remove it yourself") from error
+
+
+def open_checkpoint(path: Path) -> Checkpoint:
+    """The checkpoint in a folder, or the newest one of a log directory or of its folder `checkpoints`.
+
+    Raises:
+      Damaged: a file is missing or not what was written.
+      UserError: there is none, or it has another format.
+    """
+    if not OURS.fullmatch(path.name) and not (path / SUMS).exists():
+        found = candidates(path.parent if path.name == "checkpoints" else path)
+        if not found:
+            raise UserError(f"no checkpoint in {path}; expected a log directory of `train`, or one of the folders in its checkpoints/")
+        path = found[0]
+    try:
+        info = json.loads((path / "run.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise Damaged(f"the checkpoint {path} is damaged: run.json: {error}") from error
+    version = info.get("format") if isinstance(info, dict) else None
+    if version != FORMAT:
+        raise UserError(f"the checkpoint {path} has format {version}; this version reads format {FORMAT}")
+    _require_intact(path)
+    return Checkpoint(path, info)
 
 
 def require_same_identity(checkpoint: Checkpoint, given: Mapping[str, Any]) -> None:
@@ -126,6 +162,23 @@ def _show(value: Any) -> str:
     return json.dumps(value) if isinstance(value, dict | list) else str(value)
 
 
+def _require_intact(path: Path) -> None:
+    try:
+        lines = (path / SUMS).read_text(encoding="ascii").splitlines()
+        if [line[66:] for line in lines] != list(FILES):
+            raise Damaged(f"the checkpoint {path} is damaged: {SUMS} does not list {', '.join(FILES)}")
+        for line, name in zip(lines, FILES, strict=True):
+            if _sha256(path / name) != line[:64]:
+                raise Damaged(f"the checkpoint {path} is damaged: {name} does not have the checksum in {SUMS}")
+    except (OSError, ValueError) as error:
+        raise Damaged(f"the checkpoint {path} is damaged: {error}") from error
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
 def _single_precision(arrays: Mapping[str, Any]) -> Arrays:
     """[AGT-9]: a checkpoint is float32, also of a run that computes in float64."""
     return {name: np.asarray(array, np.float32 if np.asarray(array).dtype == np.float64 else None) for name, array in arrays.items()}
@@ -139,9 +192,15 @@ def _read_arrays(path: Path) -> Arrays:
     try:
         return load_file(path)
     except (OSError, SafetensorError) as error:
-        raise UserError(f"the checkpoint file {path} is damaged: {error}") from error
+        raise Damaged(f"the checkpoint file {path} is damaged: {error}") from error
 
 
 def _flush_to_disk(path: Path) -> None:
-    with path.open("rb+") as file:
-        os.fsync(file.fileno())
+    """A file's content, or which names a folder holds."""
+    if path.is_dir() and os.name == "nt":  # Windows flushes folders by itself and does not open them.
+        return
+    descriptor = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

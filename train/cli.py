@@ -11,7 +11,7 @@ from typing import Any, NoReturn
 from spec import hyperparameters, profiles, sizes
 from train.commands import COMMANDS
 from train.errors import UserError
-from train.options import DEFAULT_PRESET, PROCESSES, RESUME, Options, make_options, presets
+from train.options import DEFAULT_PRESET, NONFINITE, PROCESSES, RESUME, Options, make_options, presets
 from train.replay.layout import DETER_DTYPES
 
 DESCRIPTION = """Train a DreamerV3 agent.
@@ -45,6 +45,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
         return 0 if loop.run(options) else 130
     except UserError as error:
+        if error.details:
+            print(error.details.rstrip(), file=sys.stderr)
         print(f"train: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
@@ -103,6 +105,11 @@ def build_parser() -> argparse.ArgumentParser:
         help="auto: continue the run in the log directory if there is one (default); never, must: or else an error",
     )
     run.add_argument(
+        "--nonfinite",
+        choices=NONFINITE,
+        help="after a loss or gradient that is not finite: stop, and save what `train inspect` shows (default), or skip the update",
+    )
+    run.add_argument(
         "--no-preflight", dest="preflight", action="store_false", default=None, help="skip the check of the backend before training"
     )
 
@@ -110,6 +117,20 @@ def build_parser() -> argparse.ArgumentParser:
     envs.add_argument("--action-repeat", type=_whole(1), metavar="N", help="apply each action N times (default 1)")
     envs.add_argument("--image-size", type=_whole(1), metavar="N", help="side to which images are resized, in pixels (default 64)")
     envs.add_argument("--processes", choices=PROCESSES, help="one process per environment; auto: if its steps are slow (default)")
+
+    envs.add_argument(
+        "--env-timeout", type=_seconds, metavar="SECONDS", help="a process that takes longer for a step is made anew (default 600)"
+    )
+    envs.add_argument(
+        "--env-failures", type=_whole(0), metavar="N", help="environments made anew, per 100,000 steps, that end the run (default 10)"
+    )
+    envs.add_argument(
+        "--restore-envs",
+        type=_boolean,
+        metavar="true|false",
+        help="a resumed run repeats the actions of the episodes under way, so that it continues exactly; false for an environment that "
+        "must not or cannot repeat them: new episodes begin (default true)",
+    )
 
     replay = parser.add_argument_group("replay")
     replay.add_argument("--replay-memory", type=_positive, metavar="GIB", help="memory that maps the files of the buffer (default 2)")
@@ -125,6 +146,7 @@ def build_parser() -> argparse.ArgumentParser:
     schedule.add_argument("--eval-episodes", type=_whole(0), metavar="N", help="episodes of an evaluation; 0: none (default 10)")
     schedule.add_argument("--random-episodes", type=_whole(0), metavar="N", help="episodes that measure a random policy first (default 10)")
     schedule.add_argument("--checkpoint-every", type=_seconds, metavar="SECONDS", help="time between checkpoints (default 300)")
+    schedule.add_argument("--keep-checkpoints", type=_whole(1), metavar="N", help="the newest ones that stay on the disk (default 2)")
     schedule.add_argument("--log-every", type=_seconds, metavar="SECONDS", help="time between lines of metrics (default 5)")
 
     groups = {name: parser.add_argument_group(title) for name, title in GROUPS.items()}

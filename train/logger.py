@@ -1,6 +1,7 @@
 """What a run writes and shows: metrics.jsonl, TensorBoard events, and progress on the terminal."""
 
 import json
+import os
 import time
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -20,16 +21,14 @@ class Logger:
     `episode/return`, `episode/length` (one line per training episode), `evaluation/...`, `train/...` (means since the last such line),
     `speed/...` (per second), `random/return`.
 
-    Lines of steps after `step` are dropped: a run that ended without a checkpoint left them, and the resumed run writes them again. Events
+    What was written after `position` is dropped: a run that ended without a checkpoint left it, and the resumed run writes it again. Events
     for TensorBoard stay as they are.
     """
 
-    def __init__(self, logdir: Path, step: int) -> None:
+    def __init__(self, logdir: Path, position: int | None = None) -> None:
         path = logdir / "metrics.jsonl"
-        kept = [line for line in read_metrics(path) if line["step"] <= step] if step > 0 else []
-        temporary = path.with_suffix(".tmp")
-        temporary.write_text("".join(json.dumps(line) + "\n" for line in kept), encoding="utf-8")
-        temporary.replace(path)
+        path.touch()
+        os.truncate(path, min(position or 0, path.stat().st_size))
         self._file = path.open("a", encoding="utf-8")
         self._tensorboard = Writer(str(logdir))
 
@@ -39,6 +38,12 @@ class Logger:
         self._file.flush()
         for name, value in metrics.items():
             self._tensorboard.add_scalar(name, value, step)
+
+    def position(self) -> int:
+        """How long metrics.jsonl is, in bytes, all of it on the disk."""
+        self._file.flush()
+        os.fsync(self._file.fileno())
+        return self._file.tell()
 
     def close(self) -> None:
         self._file.close()

@@ -15,14 +15,15 @@ from train.errors import UserError
 DEFAULT_PRESET = "cartpole"
 RESUME = ("auto", "never", "must")
 PROCESSES = ("auto", "yes", "no")
+NONFINITE = ("stop", "skip")
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
     """Everything that a run depends on, beside the code.
 
-    steps and eval_every are environment steps: records times action_repeat. checkpoint_every and log_every are seconds. replay_memory is
-    in GiB.
+    steps and eval_every are environment steps: records times action_repeat. checkpoint_every, log_every and env_timeout are seconds.
+    replay_memory is in GiB.
     """
 
     backend: str
@@ -41,6 +42,12 @@ class Options:
     log_every: float = 5.0
     resume: str = "auto"
     processes: str = "auto"
+    env_timeout: float = 600.0
+    env_failures: int = 10
+    restore_envs: bool = True
+    keep_checkpoints: int = 2
+    nonfinite: str = "stop"
+    wandb: str | None = None
     replay_memory: float = 2.0
     replay_deter: str = "bfloat16"
     preflight: bool = True

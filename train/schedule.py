@@ -2,17 +2,17 @@
 
 import dataclasses
 import math
+import os
 import time
-from collections.abc import Iterator, Mapping
-from pathlib import Path
+from collections.abc import Iterator
 
 import numpy as np
 
-from train import checkpoint
+from train import resume
 from train.curve import draw_curve
 from train.envs import Record
-from train.errors import UserError
 from train.evaluation import Agent, Interrupted, evaluate
+from train.finite import finite_action, mean_metrics
 from train.logger import duration
 from train.state import Run
 
@@ -31,24 +31,56 @@ class Schedule:
         run.counters.seconds += now - self._clock
         self._clock = now
         if now - self._logged_at >= run.options.log_every:
-            self._log(run, now)
+            with run.clock.part("log"):
+                self._log(run, now)
         if run.interrupted:
             return
         if _evaluations_due(run) > self._evaluations_due and run.step < run.options.steps:  # At the end `finish` does it.
             self._evaluations_due = _evaluations_due(run)
-            run_evaluation(run)
-        if now - self._saved_at >= run.options.checkpoint_every:
-            save(run)
+            with run.clock.part("evaluation"):
+                run_evaluation(run)
+
+    def save(self, run: Run) -> None:
+        """To be called while the environments wait for actions: only then can their state be saved."""
+        if time.monotonic() - self._saved_at >= run.options.checkpoint_every and not run.interrupted and run.step < run.options.steps:
+            with run.clock.part("checkpoint"):
+                resume.save(run)
             self._saved_at = time.monotonic()
 
     def _log(self, run: Run, now: float) -> None:
         elapsed = max(now - self._logged_at, 1e-9)
-        steps = (run.counters.records - self._logged.records) * run.options.action_repeat / elapsed
-        train_steps = (run.counters.train_steps - self._logged.train_steps) / elapsed
-        self._logged_at, self._logged = now, dataclasses.replace(run.counters)
-        speed = {"speed/steps": steps, "speed/train_steps": train_steps}
-        run.logger.write(run.step, run.counters.seconds, {**mean_metrics(run), **speed})
+        done, before = run.counters, self._logged
+        steps = (done.records - before.records) * run.options.action_repeat / elapsed
+        train_steps = (done.train_steps - before.train_steps) / elapsed
+        speed = {
+            "speed/steps": steps,
+            "speed/policy_steps": (done.policy_steps - before.policy_steps) / elapsed,
+            "speed/train_steps": train_steps,
+        }
+        self._logged_at, self._logged = now, dataclasses.replace(done)
+        run.logger.write(run.step, done.seconds, {**mean_metrics(run), **speed, **run.clock.take(), **_state(run)})
         run.display.update(run.step, _facts(run, steps, train_steps))
+
+
+def _state(run: Run) -> dict[str, float]:
+    config = run.options.config
+    trained = run.counters.train_steps * config.batch_size * config.batch_length
+    state = {
+        "replay/items": len(run.replay),
+        "replay/ratio": trained / max(run.counters.records, 1),
+        "environments/failures": run.envs.failures,
+    }
+    memory = {"memory/resident": _resident_memory(), "memory/device": run.learner.memory()}
+    return state | {name: size / 2**30 for name, size in memory.items() if size is not None}
+
+
+def _resident_memory() -> int | None:
+    """Bytes of this process in memory, mapped files included; None where the system does not say."""
+    try:
+        with open("/proc/self/statm", encoding="ascii") as file:
+            return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except OSError:
+        return None
 
 
 def _facts(run: Run, steps: float, train_steps: float) -> Iterator[str]:
@@ -73,42 +105,10 @@ def log_episode(run: Run, score: float, length: int) -> None:
     run.logger.write(run.step, run.counters.seconds, {"episode/return": score, "episode/length": length})
 
 
-def mean_metrics(run: Run) -> dict[str, float]:
-    """Means of what the train steps since the last call returned, under `train/`.
-
-    Raises:
-      UserError: a loss or the gradient is not finite.
-    """
-    taken, run.metrics = run.metrics, []
-    means = {name: float(np.mean([float(entry[name]) for entry in taken])) for name in (taken[0] if taken else ())}
-    _require_finite(run, means)
-    return {f"train/{name}": value for name, value in means.items()}
-
-
-def _require_finite(run: Run, metrics: Mapping[str, float]) -> None:
-    for name, value in metrics.items():
-        if ("loss" in name or name == "gradient_norm") and not math.isfinite(value):  # [OPT-20]
-            raise diverged(run, name)
-
-
-def diverged(run: Run, what: str) -> UserError:
-    saved = f"the checkpoint in {run.options.logdir} is from before; " if checkpoint.find(run.options.logdir) else ""
-    return UserError(
-        f"training diverged: {what} is not finite at train step {run.counters.train_steps} (step {run.step}); "
-        f"{saved}try a smaller --learning-rate or another --compute-dtype, with a --logdir of its own"
-    )
-
-
-def finite_action(run: Run, action: np.ndarray) -> np.ndarray:
-    """The policy's action in float32. [LOOP-12]
-
-    Raises:
-      UserError: a number is not finite.
-    """
-    action = np.array(action, np.float32)
-    if not np.isfinite(action).all():
-        raise diverged(run, "the policy's action")
-    return action
+def log_failures(run: Run) -> None:
+    """Environments that had to be made anew."""
+    for failure in run.envs.take_failures():
+        run.display.say(f"environment {failure.worker} was made anew, its episode is abandoned ({failure.kind}): {failure.message}")
 
 
 def run_evaluation(run: Run) -> None:
@@ -133,39 +133,15 @@ def run_evaluation(run: Run) -> None:
     run.logger.write(run.step, counters.seconds, {f"evaluation/{name}": value for name, value in metrics.items()})
 
 
-def save(run: Run) -> Path:
-    """Writes a checkpoint: [LOOP-21].
-
-    Raises:
-      UserError: the disk refuses it, or the run has diverged (then the checkpoint before stays).
-    """
-    for metrics in run.metrics[-1:]:
-        _require_finite(run, {name: float(value) for name, value in metrics.items()})
-    name = checkpoint.name_of(run.step)
-    description, drawn = run.replay.save(name)
-    info = {
-        "identity": run.options.identity(),
-        "spaces": run.envs.spaces.to_json(),
-        "backend": run.options.backend,
-        "counters": dataclasses.asdict(run.counters),
-        "replay_ratio": run.ratio.state_dict(),
-        "random_return": run.random_return,
-        "evaluation": run.evaluation,
-        "replay": description,
-    }
-    path = checkpoint.save(run.options.logdir, run.step, run.learner.state_dict(), drawn, info)
-    run.replay.replay.keep([name])
-    return path
-
-
 def finish(run: Run) -> None:
     """The last evaluation, the last checkpoint, the picture, and what came of it all."""
-    if run.metrics:
-        run.logger.write(run.step, run.counters.seconds, mean_metrics(run))
+    metrics = mean_metrics(run)
+    if metrics:
+        run.logger.write(run.step, run.counters.seconds, metrics)
     if run.evaluation is None or run.evaluation["step"] != run.step:
-        save(run)  # An evaluation may take long, and whatever ends it must not cost the training.
+        resume.save(run)  # An evaluation may take long, and whatever ends it must not cost the training.
         run_evaluation(run)
-        save(run)
+        resume.save(run)
     options = run.options
     title = f"{options.task}, {options.backend}, seed {options.seed}"
     picture = draw_curve(options.logdir, title, run.random_return)

@@ -9,55 +9,63 @@ import numpy as np
 
 from reference_numpy.training_loop import ReplayRatio, derive_seed
 from spec import Spaces, parameter_table
-from train import checkpoint
+from train import checkpoint, resume
 from train.backend import Learner, learner_class
 from train.checkpoint import Checkpoint
-from train.envs import ContractEnv, Environments, is_slow, make_env
+from train.envs import ContractEnv, Environments, Record, is_slow, make_env
 from train.errors import UserError
 from train.evaluation import play_randomly
 from train.logger import Display, Logger
 from train.options import Options
 from train.replay import Prefetcher, Replay, erase
-from train.state import Counters, Run
+from train.state import Counters, Run, Scores
 
 
 def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -> Run:
     """Everything that can go wrong is tried here, the cheap things first. What must be closed is left to the stack."""
     _require_writable(options)
     _require_trainable(options)
-    saved = _find_checkpoint(options)
-    if saved:
-        checkpoint.require_same_identity(saved, options.identity())
+    display = Display(options.steps)
+    saved = _find_checkpoint(options, display)
     learner_type = learner or _import_learner(options.backend)
     envs, test_envs = _make_environments(options, stack)
     if saved:
         checkpoint.require_same_spaces(saved, envs.spaces.to_json())
     parameters = _count_parameters(options, envs.spaces)
-    step = saved.info["counters"]["records"] * options.action_repeat if saved else 0
-    display = Display(options.steps)
     agent = _make_learner(learner_type, options, envs.spaces)  # Before preflight: it says what is wrong with the device.
     if options.preflight:
         _preflight(options, envs.spaces, display)
+    replay, saved, record = _open_replay(options, saved, envs, display)
+    starts = saved.info["counters"]["starts"] if saved else 0
     run = Run(
         options=options,
         envs=envs,
         test_envs=test_envs,
         learner=agent,
-        replay=stack.enter_context(closing(_make_replay(options, saved, display))),
+        replay=stack.enter_context(closing(replay)),
         ratio=ReplayRatio(options.config.replay_ratio, options.config.batch_size * options.config.batch_length),
-        logger=stack.enter_context(closing(Logger(options.logdir, step))),
+        logger=stack.enter_context(closing(Logger(options.logdir, saved.info["log"] if saved else None))),
         display=display,
         counters=Counters(),
+        scores=Scores(envs.count),
+        record=record or _begin(options, envs, starts),
+        carry=agent.initial_carry(envs.count),
     )
     display.say(
         f"{options.task}: {options.backend} on {run.learner.device}, {parameters:,} parameters, {envs.count} environments, "
         f"seed {options.seed}; logs in {options.logdir}"
     )
     if saved:
-        _restore(run, saved)
+        resume.restore(run, saved, exactly=record is not None)
     else:
         _measure_random_policy(run)
+    run.counters.starts += record is None
     return run
+
+
+def _begin(options: Options, envs: Environments, starts: int) -> Record:
+    """The first records of new episodes everywhere: [LOOP-25]."""
+    return envs.reset([derive_seed(options.seed, "environment", worker + envs.count * starts) for worker in range(envs.count)])
 
 
 def _require_writable(options: Options) -> None:
@@ -80,8 +88,8 @@ def _require_trainable(options: Options) -> None:
         )
 
 
-def _find_checkpoint(options: Options) -> Checkpoint | None:
-    saved = checkpoint.find(options.logdir)
+def _find_checkpoint(options: Options, display: Display) -> Checkpoint | None:
+    saved = resume.find(options, display)
     if saved and options.resume == "never":
         raise UserError(f"{options.logdir} holds a run already, and --resume is never; choose another --logdir")
     if not saved and options.resume == "must":
@@ -104,11 +112,11 @@ def _make_environments(options: Options, stack: ExitStack) -> tuple[Environments
     count, processes = options.config.envs, options.processes == "yes"
     if options.processes == "auto" and count > 1:
         processes = is_slow(make, options.seed)
-    envs = stack.enter_context(closing(Environments(make, count, processes)))
+    envs = stack.enter_context(closing(Environments(make, count, processes, options.env_timeout, options.env_failures)))
     tests = min(count, max(options.eval_episodes, options.random_episodes))
     if not tests:
         return envs, None
-    return envs, stack.enter_context(closing(Environments(make, tests, processes)))
+    return envs, stack.enter_context(closing(Environments(make, tests, processes, options.env_timeout, options.env_failures)))
 
 
 def _make_one(options: Options, index: int) -> ContractEnv:
@@ -137,24 +145,42 @@ def _preflight(options: Options, spaces: Spaces, display: Display) -> None:
 
 def _make_learner(learner: type[Learner], options: Options, spaces: Spaces) -> Learner:
     try:
-        return learner(spaces, options.config, seed=derive_seed(options.seed, "parameters", 0), device=options.device)
+        return learner(
+            spaces, options.config, seed=derive_seed(options.seed, "parameters", 0), device=options.device, nonfinite=options.nonfinite
+        )
     except ValueError as error:  # Spaces and configuration have been checked: what is left is the device.
         raise UserError(f"the backend {options.backend} does not run with --device {options.device}: {error}") from error
 
 
-def _make_replay(options: Options, saved: Checkpoint | None, display: Display) -> Prefetcher:
-    """The buffer in LOGDIR/replay: that of the checkpoint, or an empty one."""
+def _open_replay(
+    options: Options, saved: Checkpoint | None, envs: Environments, display: Display
+) -> tuple[Prefetcher, Checkpoint | None, Record | None]:
+    """The buffer in LOGDIR/replay, the checkpoint that it is from, and the records of the environments if they were restored.
+
+    A checkpoint whose buffer is damaged is given up for the one before.
+    """
     config, directory = options.config, options.logdir / "replay"
     settings: dict[str, Any] = {
         "memory_limit": int(options.replay_memory * 2**30),
         "deter_dtype": options.replay_deter,
         "classes": config.classes,
     }
-    if saved:
+    replay = record = None
+    while saved and not replay:
+        record = resume.restore_environments(saved, envs, display) if options.restore_envs else None
         try:
-            replay = Replay.restore(directory, saved.info["replay"], config.replay_capacity, config.batch_length, **settings)
+            replay = Replay.restore(
+                directory,
+                saved.info["replay"],
+                config.replay_capacity,
+                config.batch_length,
+                continue_streams=record is not None,
+                **settings,
+            )
         except ValueError as error:
-            raise UserError(f"the replay buffer of the checkpoint {saved.path} cannot be restored: {error}") from error
+            resume.give_up(saved.path, error, display)
+            saved = resume.find(options, display)
+    if replay:
         for line in replay.warnings:
             display.say(f"replay: {line}")
     else:
@@ -164,22 +190,7 @@ def _make_replay(options: Options, saved: Checkpoint | None, display: Display) -
     def uniform(train_step: int) -> np.ndarray:
         return np.random.Generator(np.random.PCG64(derive_seed(options.seed, "replay", train_step))).random(config.batch_size)
 
-    return Prefetcher(replay, uniform, saved.info["counters"]["train_steps"] if saved else 0)
-
-
-def _restore(run: Run, saved: Checkpoint) -> None:
-    """Continues where the checkpoint stopped: [LOOP-23]."""
-    info = saved.info
-    try:
-        run.learner.load_state_dict(saved.learner)
-        run.replay.load_drawn(saved.drawn)
-    except ValueError as error:
-        raise UserError(f"the checkpoint {saved.path} does not fit this version: {error}") from error
-    run.ratio.load_state_dict(info["replay_ratio"])
-    run.counters = Counters(**info["counters"])
-    run.random_return, run.evaluation = info["random_return"], info["evaluation"]
-    made_by = "" if info["backend"] == run.options.backend else f", which {info['backend']} has trained so far"
-    run.display.say(f"continuing at step {run.step:,} from {saved.path}{made_by}")
+    return Prefetcher(replay, uniform, saved.info["counters"]["train_steps"] if saved else 0), saved, record
 
 
 def _measure_random_policy(run: Run) -> None:

@@ -5,9 +5,12 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from reference_numpy.training_loop import ReplayRatio
 from train.backend import Learner
-from train.envs import Environments
+from train.clock import Clock
+from train.envs import Environments, Record
 from train.logger import Display, Logger
 from train.options import Options
 from train.replay import Prefetcher
@@ -15,7 +18,7 @@ from train.replay import Prefetcher
 
 @dataclasses.dataclass
 class Counters:
-    """How far a run is. records: environment steps without action repeat; starts: of this run, resumed ones included."""
+    """How far a run is. records: environment steps without action repeat; starts: how often all environments began anew."""
 
     records: int = 0
     policy_steps: int = 0
@@ -27,11 +30,51 @@ class Counters:
     seconds: float = 0.0
 
 
+class Scores:
+    """Returns and lengths of the episodes under way: [LOOP-20]."""
+
+    def __init__(self, count: int) -> None:
+        self.total = np.zeros(count)
+        self.length = np.zeros(count, np.int64)
+
+    def update(self, record: Record) -> list[tuple[float, int]]:
+        """(return, length) of the episodes that end with these records."""
+        self.total = np.where(record["is_first"], 0.0, self.total) + record["reward"]
+        self.length = np.where(record["is_first"], 0, self.length) + 1
+        return [(float(self.total[worker]), int(self.length[worker])) for worker in np.flatnonzero(record["is_last"])]
+
+
+class Means:
+    """Means of metrics since they were last taken."""
+
+    def __init__(self, sums: Mapping[str, tuple[float, int]] | None = None) -> None:
+        self.sums = {name: (float(total), int(count)) for name, (total, count) in (sums or {}).items()}  # name -> sum, how many
+
+    def add(self, metrics: Mapping[str, float]) -> None:
+        for name, value in metrics.items():
+            total, count = self.sums.get(name, (0.0, 0))
+            self.sums[name] = total + value, count + 1
+
+    def take(self) -> dict[str, float]:
+        sums, self.sums = self.sums, {}
+        return {name: total / count for name, (total, count) in sums.items()}
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainStep:
+    """A train step whose metrics have not been looked at yet."""
+
+    number: int
+    seed: int
+    batch: Mapping[str, np.ndarray]
+    metrics: Mapping[str, Any]
+
+
 @dataclasses.dataclass
 class Run:
     """Everything that a run is made of.
 
-    metrics: of the train steps since the last line of metrics.
+    record, carry: the newest records of the environments, and the policy's carry before it has seen them.
     interrupted: the signals that asked the run to end.
     """
 
@@ -44,10 +87,15 @@ class Run:
     logger: Logger
     display: Display
     counters: Counters
+    scores: Scores
+    record: Record
+    carry: Any
+    clock: Clock = dataclasses.field(default_factory=Clock)
+    means: Means = dataclasses.field(default_factory=Means)  # of the train steps since the last line of metrics
+    unsettled: TrainStep | None = None  # the newest train step
     random_return: float | None = None
     evaluation: dict[str, float] | None = None  # of the last evaluation: step, return
     returns: collections.deque[float] = dataclasses.field(default_factory=lambda: collections.deque(maxlen=20))  # of the last episodes
-    metrics: list[Mapping[str, Any]] = dataclasses.field(default_factory=list)
     interrupted: list[int] = dataclasses.field(default_factory=list)
 
     @property

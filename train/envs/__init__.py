@@ -2,12 +2,16 @@
 
 from train.envs.adapter import ContractEnv
 from train.envs.factory import make_env
+from train.envs.history import History
 from train.envs.spaces import Translation, random_actions, translate
+from train.envs.stream import Failure
 from train.envs.vector import Environments, Record, is_slow
 
 __all__ = [
     "ContractEnv",
     "Environments",
+    "Failure",
+    "History",
     "Record",
     "Translation",
     "is_slow",

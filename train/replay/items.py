@@ -80,10 +80,10 @@ def require_representable(number: int, position: int) -> None:
     """Raises:
     ValueError: more streams or records than the index can tell apart; eight million starts or a trillion steps of one worker.
     """
-    if not are_representable(number, position):
+    if number >= _STREAMS or position >= _POSITIONS:
         raise ValueError(f"stream {number}, position {position}: the index holds {_STREAMS} streams of {_POSITIONS} records")
 
 
-def are_representable(number: int, positions: Any) -> bool:
-    """Whether the index can tell these apart; positions: a number or an array."""
+def are_representable(number: int, positions: NDArray[Any]) -> bool:
+    """Whether the index can tell these apart."""
     return number < _STREAMS and bool(np.all(positions < _POSITIONS))

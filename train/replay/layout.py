@@ -9,6 +9,7 @@ copy per section.
 import dataclasses
 import json
 import math
+import sys
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -196,10 +197,10 @@ def to_bfloat16(x: NDArray[np.float32]) -> NDArray[np.uint16]:
     rounded &= 1
     rounded += 0x7FFF
     rounded += bits
-    rounded >>= 16
+    upper = rounded.view(np.uint16)[..., sys.byteorder == "little" :: 2]
     with np.errstate(all="ignore"):
         suspicious = not np.isfinite(x.sum())  # A NaN could round to an infinity or wrap around; looking at each would cost as much again.
-    return np.where(np.isnan(x), 0x7FC0, rounded).astype(np.uint16) if suspicious else rounded.astype(np.uint16)
+    return np.where(np.isnan(x), np.uint16(0x7FC0), upper) if suspicious else upper
 
 
 def from_bfloat16(upper: NDArray[np.uint16]) -> NDArray[np.float32]:

@@ -71,7 +71,7 @@ class Storage:
         if offset == 0:
             self._begin_block(stream, position)
         assert stream.stage is not None
-        for target, source in zip(stream.stage.sections, packed, strict=True):
+        for target, source in zip(stream.stage.sections, packed, strict=False):  # As many of both: this runs for every record.
             target[offset] = source[row]
         stream.count = position + 1
 

@@ -1,0 +1,278 @@
+"""Checkpoints of `train` with a learner that keeps a diary: what they carry over, and what survives an interruption."""
+
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import pytest
+from train_fakes import EPISODE, FakeLearner
+from train_runs import Make, batches, run_quietly, stored
+
+from reference_numpy.training_loop import derive_seed
+from train import checkpoint, loop, setup
+from train.errors import UserError
+from train.logger import read_metrics
+from train.resume import save
+
+# Checkpoints
+
+
+@pytest.mark.covers("LOOP-21", "LOOP-23")
+def test_a_resumed_run_goes_on_where_it_stopped(make: Make) -> None:
+    whole = run_quietly(make(steps=120, logdir=make().logdir / "whole"))
+    with ExitStack() as stack:
+        state = setup.prepare(make(steps=60), FakeLearner, stack)
+        loop.train(state)
+        loop.finish(state)
+    half = dataclasses.replace(state.counters)
+    FakeLearner.diary.clear()
+    resumed = run_quietly(make(steps=120))
+    assert resumed.counters.records == 120
+    assert resumed.counters.starts == 2
+    assert resumed.counters.train_steps == whole.counters.train_steps, "an extra train step, or one too few"
+    assert len(batches()) == whole.counters.train_steps - half.train_steps
+    streams = stored(resumed)
+    assert [bool(stream["is_first"][0]) for stream in streams] == [True] * 4, "fresh resets begin new streams"
+    assert sum(len(stream["reward"]) for stream in streams) == 120
+    assert resumed.counters.policy_steps == 60
+    assert sum(kind == "policy" for kind, _ in FakeLearner.diary) == 30
+
+
+@pytest.mark.covers("LOOP-24", "LOOP-25", "LOOP-26")
+def test_seeds_are_those_of_the_chapter_and_go_on_after_a_resume(make: Make) -> None:
+    FakeLearner.seeds.clear()
+    options = make(steps=40, eval_every=20, eval_episodes=2, seed=7)
+    loop.run(options, FakeLearner)
+    resumed = run_quietly(dataclasses.replace(options, steps=80))
+    seeds = FakeLearner.seeds
+    assert [seed for kind, seed in seeds if kind == "parameters"] == [derive_seed(7, "parameters", 0)] * 2
+    steps = resumed.counters.train_steps
+    assert steps > 0
+    assert [seed for kind, seed in seeds if kind == "train"] == [derive_seed(7, "train", step) for step in range(steps)]
+    acting = [seed for kind, seed in seeds if kind == "policy"]
+    training = [derive_seed(7, "policy", step) for step in range(resumed.counters.policy_steps)]
+    assert [seed for seed in acting if seed in training] == training
+    evaluating = [derive_seed(7, "evaluation", step) for step in range(resumed.counters.evaluation_steps)]
+    assert [seed for seed in acting if seed not in training] == evaluating
+    assert len(evaluating) == 3 * EPISODE
+
+
+def test_a_resumed_run_meets_new_episodes(make: Make) -> None:
+    """Its environments have seeds of their own: they do not begin as those of the first start did."""
+    options = make(task="gym:CartPole-v1", steps=40, replay_ratio=0)
+    loop.run(options, FakeLearner)
+    streams = stored(run_quietly(dataclasses.replace(options, steps=80)))
+    starts = {tuple(stream["observation"][0].tolist()) for stream in streams}
+    assert len(starts) == len(streams) == 4
+
+
+def test_metrics_after_the_checkpoint_are_dropped_on_resume(make: Make) -> None:
+    loop.run(make(), FakeLearner)
+    path = make().logdir / "metrics.jsonl"
+    kept = path.read_text()
+    path.write_text(kept + json.dumps({"step": 70, "seconds": 1.0, "episode/return": -1.0}) + '\n{"step": 71, "sec')
+    loop.run(make(steps=90), FakeLearner)
+    lines = read_metrics(path)
+    assert not any(line.get("episode/return") == -1.0 for line in lines)
+    assert path.read_text().startswith(kept)
+    assert lines[-1]["step"] == 90
+
+
+def test_a_finished_run_says_its_result_again(make: Make, capsys: pytest.CaptureFixture[str]) -> None:
+    options = make(eval_episodes=2, random_episodes=2)
+    loop.run(options, FakeLearner)
+    first = capsys.readouterr().out.splitlines()[-1]
+    FakeLearner.diary.clear()
+    assert loop.run(options, FakeLearner)
+    assert capsys.readouterr().out.splitlines()[-1] == first
+    assert FakeLearner.diary == []
+
+
+def test_another_backend_may_continue(make: Make, capsys: pytest.CaptureFixture[str]) -> None:
+    loop.run(make(), FakeLearner)
+    loop.run(dataclasses.replace(make(steps=90), backend="torch"), FakeLearner)
+    assert "which jax has trained so far" in capsys.readouterr().out
+
+
+@pytest.mark.covers("LOOP-21")
+def test_another_configuration_is_refused_with_all_differences(make: Make) -> None:
+    loop.run(make(), FakeLearner)
+    other = make(seed=1, learning_rate=1e-3, task="train_fakes:nan_observation")
+    with pytest.raises(UserError) as error:
+        loop.run(other, FakeLearner)
+    assert all(
+        words in str(error.value)
+        for words in (
+            "seed: 0 in the checkpoint, 1 given",
+            "learning_rate: 4e-05 in the checkpoint, 0.001 given",
+            "task: train_fakes:Counting in the checkpoint, train_fakes:nan_observation given",
+        )
+    )
+    assert "batch_size" not in str(error.value)
+
+
+def test_other_spaces_are_refused(make: Make) -> None:
+    loop.run(make(), FakeLearner)
+    saved = checkpoint.open_checkpoint(make().logdir)
+    assert saved
+    spaces = {"observations": {"observation": {"kind": "vector", "size": 3}}, "actions": saved.info["spaces"]["actions"]}
+    with pytest.raises(UserError, match=r'observations observation: {"kind": "vector", "size": 2} in the checkpoint'):
+        checkpoint.require_same_spaces(saved, spaces)
+
+
+@pytest.mark.parametrize("resume", ["never", "must"])
+def test_resume_never_and_must(make: Make, resume: str) -> None:
+    if resume == "never":
+        loop.run(make(), FakeLearner)
+    with pytest.raises(UserError, match=f"--resume is {resume}"):
+        loop.run(make(resume=resume), FakeLearner)
+
+
+@pytest.mark.covers("LOOP-22")
+def test_a_checkpoint_is_complete_or_absent(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    loop.run(make(), FakeLearner)
+    before = checkpoint.open_checkpoint(make().logdir)
+
+    def fail(*_: Any) -> None:
+        raise OSError("disk full")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoint, "_flush_to_disk", fail)
+        with pytest.raises(UserError, match="disk full"):
+            loop.run(make(steps=90), FakeLearner)
+    assert checkpoint.open_checkpoint(make().logdir) == before
+    loop.run(make(steps=90), FakeLearner)
+    assert sorted(path.name for path in (make().logdir / "checkpoints").iterdir()) == ["000000000060", "000000000090"]
+
+
+def test_a_save_spares_what_is_not_ours(make: Make) -> None:
+    directory = make().logdir / "checkpoints"
+    (directory / "best").mkdir(parents=True)
+    (directory / ".DS_Store").touch()
+    loop.run(make(), FakeLearner)
+    assert sorted(path.name for path in directory.iterdir()) == [".DS_Store", "000000000060", "best"]
+
+
+@pytest.mark.covers("LOOP-22")
+def test_a_step_that_is_saved_again_is_never_without_a_checkpoint(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    with ExitStack() as stack:
+        state = setup.prepare(make(), FakeLearner, stack)
+        loop.train(state)
+        path = save(state)
+        rename = Path.rename
+        monkeypatch.setattr(Path, "rename", lambda self, target: 1 / 0 if target == path else rename(self, target))
+        with pytest.raises(ZeroDivisionError):
+            save(state)
+    found = checkpoint.open_checkpoint(make().logdir)
+    assert found
+    assert found.path.name == f"{path.name}.old"
+    assert found.info["replay"]
+
+
+@pytest.mark.parametrize("name", ["learner.safetensors", "loop.safetensors", "run.json", "SHA256SUMS", "replay"])
+@pytest.mark.parametrize("damage", ["cut off", "a flipped bit", "missing"])
+def test_a_damaged_checkpoint_falls_back_to_the_one_before(make: Make, name: str, damage: str, capsys: pytest.CaptureFixture[str]) -> None:
+    whole = run_quietly(make(steps=120, logdir=make().logdir / "whole"))
+    loop.run(make(steps=60), FakeLearner)
+    loop.run(make(steps=90), FakeLearner)
+    newest = make().logdir / "checkpoints" / "000000000090"
+    path = newest / name if name != "replay" else max((make().logdir / "replay").glob("saved-*"))
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 4
+    path.write_bytes(content if damage == "a flipped bit" else content[:20])
+    if damage == "missing":
+        path.unlink()
+    capsys.readouterr()
+    resumed = run_quietly(make(steps=120))
+    output = capsys.readouterr().out
+    assert f"renamed to {newest}.damaged" in next(line for line in output.splitlines() if line.startswith("WARNING"))
+    assert "continuing at step 60" in output
+    assert (newest.parent / "000000000090.damaged").is_dir()
+    assert (resumed.counters.records, resumed.counters.train_steps) == (120, whole.counters.train_steps)
+    assert sum(len(stream["reward"]) for stream in stored(resumed)) == 120
+
+
+def test_a_run_whose_checkpoints_are_all_damaged_does_not_begin_anew(make: Make) -> None:
+    loop.run(make(), FakeLearner)
+    (make().logdir / "checkpoints" / "000000000060" / "learner.safetensors").write_bytes(b"")
+    for _ in range(2):
+        with pytest.raises(UserError, match=r"damaged checkpoints only: .*000000000060.damaged"):
+            loop.run(make(steps=90), FakeLearner)
+    assert list((make().logdir / "replay").iterdir())
+
+
+def test_a_checkpoint_of_another_format_is_refused(make: Make) -> None:
+    loop.run(make(), FakeLearner)
+    path = make().logdir / "checkpoints" / "000000000060" / "run.json"
+    path.write_text(path.read_text().replace('"format": 3', '"format": 2'))
+    with pytest.raises(UserError, match="format 2; this version reads format 3"):
+        loop.run(make(steps=90), FakeLearner)
+
+
+def test_the_newest_checkpoints_are_kept(make: Make) -> None:
+    for steps in (20, 40, 60, 80):
+        loop.run(make(steps=steps, keep_checkpoints=3), FakeLearner)
+    names = sorted(path.name for path in (make().logdir / "checkpoints").iterdir())
+    assert names == ["000000000040", "000000000060", "000000000080"]
+    for name in names:
+        path = make().logdir / "checkpoints" / name
+        assert subprocess.run(["sha256sum", "--check", "--quiet", "SHA256SUMS"], cwd=path, check=False).returncode == 0
+
+
+def test_the_first_interrupt_saves(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    policy = FakeLearner.policy
+
+    def interrupt(self: FakeLearner, *arguments: Any) -> Any:
+        if sum(kind == "policy" for kind, _ in FakeLearner.diary) == 20:
+            os.kill(os.getpid(), signal.SIGINT)
+        return policy(self, *arguments)
+
+    handler = signal.getsignal(signal.SIGINT)
+    monkeypatch.setattr(FakeLearner, "policy", interrupt)
+    assert not loop.run(make(), FakeLearner)
+    saved = checkpoint.open_checkpoint(make().logdir)
+    assert saved
+    assert saved.info["counters"]["records"] == 42
+    assert signal.getsignal(signal.SIGINT) is handler
+
+
+def test_an_interrupt_abandons_an_evaluation(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Evaluation is due at step 20, after 10 policy steps; the signal comes in its second step."""
+    policy = FakeLearner.policy
+
+    def interrupt(self: FakeLearner, *arguments: Any) -> Any:
+        if sum(kind == "policy" for kind, _ in FakeLearner.diary) == 11:
+            os.kill(os.getpid(), signal.SIGINT)
+        return policy(self, *arguments)
+
+    monkeypatch.setattr(FakeLearner, "policy", interrupt)
+    options = make(eval_every=20, eval_episodes=40)
+    assert not loop.run(options, FakeLearner)
+    saved = checkpoint.open_checkpoint(options.logdir)
+    assert saved
+    assert saved.info["counters"]["records"] == 20
+    assert (saved.info["counters"]["evaluations"], saved.info["evaluation"]) == (0, None)
+    assert not any("evaluation/return" in line for line in read_metrics(options.logdir / "metrics.jsonl"))
+
+
+def test_what_ends_the_last_evaluation_does_not_cost_the_training(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: Any) -> list[float]:
+        raise KeyboardInterrupt
+
+    options = make(eval_episodes=2)
+    with monkeypatch.context() as patch:
+        patch.setattr("train.schedule.evaluate", fail)
+        with pytest.raises(KeyboardInterrupt):
+            loop.run(options, FakeLearner)
+    saved = checkpoint.open_checkpoint(options.logdir)
+    assert saved
+    assert saved.info["counters"]["records"] == 60
+    FakeLearner.diary.clear()
+    assert loop.run(options, FakeLearner)
+    assert batches() == []
+    assert any("evaluation/return" in line for line in read_metrics(options.logdir / "metrics.jsonl"))

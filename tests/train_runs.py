@@ -1,0 +1,37 @@
+"""Short runs of `train` with the fake learner, for the tests that look into them."""
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from typing import Any
+
+import numpy as np
+from train_fakes import FakeLearner
+
+from train import loop, setup
+from train.options import Options
+
+SMALL = {"deter": 8, "units": 4, "stoch": 2, "classes": 2, "batch_size": 2, "batch_length": 3, "envs": 2, "replay_capacity": 500}
+BATCH_STEPS = SMALL["batch_size"] * SMALL["batch_length"]
+
+Make = Callable[..., Options]
+
+
+def run_quietly(options: Options) -> Any:
+    """The state of a run after its loop."""
+    with ExitStack() as stack:
+        state = setup.prepare(options, FakeLearner, stack)
+        loop.train(state)
+        return state
+
+
+def batches() -> list[dict[str, np.ndarray]]:
+    return [entry for kind, entry in FakeLearner.diary if kind == "train"]
+
+
+def stored(state: Any) -> list[dict[str, np.ndarray]]:
+    """The records of each stream of a replay buffer, in order."""
+    saved = state.replay.replay.state_dict()
+    keys = [name for name in saved if name.startswith("records/")]
+    ends = np.cumsum(saved["streams"][:, 2])
+    parts = [slice(end - count, end) for end, count in zip(ends, saved["streams"][:, 2], strict=True)]
+    return [{name.removeprefix("records/"): saved[name][part] for name in keys} for part in parts]

@@ -1,0 +1,58 @@
+"""Numbers that are not finite: noticed, saved for inspection, and the end of the run, or skipped. [LOOP-12], [OPT-20]"""
+
+import math
+
+import numpy as np
+
+from train import checkpoint
+from train.errors import UserError
+from train.state import Run
+
+
+def settle(run: Run) -> None:
+    """Looks at the metrics of the newest train step, which must be computed or will be waited for.
+
+    Raises:
+      UserError: a loss or the gradient is not finite, and the run does not skip such updates. What is needed to find out why is saved.
+    """
+    step, run.unsettled = run.unsettled, None
+    if step is None:
+        return
+    metrics = {name: float(value) for name, value in step.metrics.items()}
+    broken = [name for name, value in metrics.items() if _must_be_finite(name) and not math.isfinite(value)]
+    if not broken:
+        run.means.add(metrics)
+    elif run.options.nonfinite == "skip":
+        run.means.add({"skipped": metrics["skipped"]})
+    else:
+        raise diverged(run, ", ".join(broken))
+
+
+def _must_be_finite(name: str) -> bool:
+    return "loss" in name or name == "gradient_norm"  # [OPT-20]
+
+
+def mean_metrics(run: Run) -> dict[str, float]:
+    """Means over the train steps since the last call, under `train/`."""
+    settle(run)
+    return {f"train/{name}": value for name, value in run.means.take().items()}
+
+
+def diverged(run: Run, what: str) -> UserError:
+    saved = f"the checkpoint in {run.options.logdir} is from before; " if checkpoint.candidates(run.options.logdir) else ""
+    return UserError(
+        f"training diverged: {what} is not finite at train step {run.counters.train_steps} (step {run.step}); "
+        f"{saved}try a smaller --learning-rate or another --compute-dtype, with a --logdir of its own"
+    )
+
+
+def finite_action(run: Run, action: np.ndarray) -> np.ndarray:
+    """The policy's action in float32. [LOOP-12]
+
+    Raises:
+      UserError: a number is not finite.
+    """
+    action = np.array(action, np.float32)
+    if not np.isfinite(action).all():
+        raise diverged(run, "the policy's action")
+    return action
