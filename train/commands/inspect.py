@@ -71,7 +71,7 @@ def _find_incident(path: Path) -> Path:
         return path
     found = newest_incident(path)
     if found is None:
-        raise UserError(f"{path} holds no incident: no train step of it was stopped or skipped. For a checkpoint give its own folder")
+        raise UserError(f"{path} holds no incident: no train step has stopped this run. For a checkpoint give its own folder")
     return found
 
 
