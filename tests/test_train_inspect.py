@@ -210,6 +210,8 @@ def test_checkpoints(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert "is a checkpoint; --rerun needs an incident" in refused(capsys, path, "--rerun")
     (path / "learner.safetensors").write_bytes(b"x" * 20)
     assert f"the checkpoint {path} is damaged: learner.safetensors" in refused(capsys, path)
+    (path / "run.json").unlink()
+    assert f"the checkpoint {path} is damaged: " in refused(capsys, path)
 
 
 def test_what_is_neither(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

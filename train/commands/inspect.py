@@ -41,7 +41,7 @@ def main(arguments: Sequence[str]) -> int:
     options = _parser().parse_args(arguments)
     console = Console(highlight=False, markup=False)
     path = options.path
-    if (path / "run.json").is_file():
+    if path.parent.name == "checkpoints" or (path / "run.json").exists():
         if options.rerun:
             raise UserError(f"{path} is a checkpoint; --rerun needs an incident, which has a batch")
         _show_checkpoint(console, path)
@@ -71,7 +71,7 @@ def _find_incident(path: Path) -> Path:
         return path
     found = newest_incident(path)
     if found is None:
-        raise UserError(f"{path} holds no incident: no train step of it was stopped or skipped. For a checkpoint give its own folder")
+        raise UserError(f"{path} holds no incident: no train step has stopped this run. For a checkpoint give its own folder")
     return found
 
 
