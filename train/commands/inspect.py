@@ -13,9 +13,9 @@ from rich.table import Table
 
 from spec import Spaces, hyperparameters, load_config, parameter_table
 from train.backend import learner_class
+from train.checkpoint import Checkpoint, open_checkpoint
 from train.cli import Parser
 from train.errors import UserError
-from train.files import read_arrays, read_json
 from train.nonfinite import Incident, Tally, load_incident, newest_incident, nonfinite, offending, tally
 
 DESCRIPTION = """Show what a train step met whose loss or gradient was not finite, or what a checkpoint holds.
@@ -44,7 +44,7 @@ def main(arguments: Sequence[str]) -> int:
     if path.parent.name == "checkpoints" or (path / "run.json").exists():
         if options.rerun:
             raise UserError(f"{path} is a checkpoint; --rerun needs an incident, which has a batch")
-        _show_checkpoint(console, path)
+        _show_checkpoint(console, open_checkpoint(path))
         return 0
     incident = load_incident(_find_incident(path))
     _show_incident(console, incident)
@@ -186,13 +186,9 @@ def rerun(incident: Incident, device: str | None) -> tuple[bool, str]:
 # A checkpoint
 
 
-def _show_checkpoint(console: Console, path: Path) -> None:
-    try:
-        info, state = read_json(path / "run.json"), read_arrays(path / "learner.safetensors")
-    except (OSError, ValueError) as error:
-        raise UserError(f"the checkpoint {path} is damaged: {error}") from error
-    counters = info.get("counters")
-    console.print(f"{path}", soft_wrap=True)
+def _show_checkpoint(console: Console, checkpoint: Checkpoint) -> None:
+    state, counters = checkpoint.learner, checkpoint.info.get("counters")
+    console.print(f"{checkpoint.path}", soft_wrap=True)
     if isinstance(counters, dict):
         console.print(_listed((f"{name.replace('_', ' ')} {value}" for name, value in counters.items()), 10))
     broken = offending("state", state)
