@@ -133,3 +133,39 @@ class Spaces:
             "observations": {key: describe(space) for key, space in self.observations.items()},
             "actions": {key: describe(space) for key, space in self.actions.items()},
         }
+
+    @classmethod
+    def from_json(cls, description: Any) -> "Spaces":
+        """The inverse of `to_json`.
+
+        Raises:
+          ValueError: anything that `to_json` does not write.
+        """
+        match description:
+            case {"observations": dict(observations), "actions": dict(actions)}:
+                return cls(
+                    {key: _from_json(f"observation {key!r}", entry, _OBSERVED) for key, entry in observations.items()},
+                    {key: _from_json(f"action {key!r}", entry, _CHOSEN) for key, entry in actions.items()},
+                )
+        raise ValueError(f"spaces: expected an object with the objects observations and actions, got {description!r:.80}")
+
+
+_OBSERVED, _CHOSEN = (Vector, Discrete, Image), (Vector, Discrete)
+
+
+def _from_json(name: str, entry: Any, kinds: tuple[type, ...]) -> Any:
+    space: Any = None
+    match entry:
+        case {"kind": "vector", "size": size} if _whole(size):
+            space = Vector(size)
+        case {"kind": "discrete", "classes": [*classes]} if _whole(*classes):
+            space = Discrete(tuple(classes))
+        case {"kind": "image", "height": height, "width": width, "channels": channels} if _whole(height, width, channels):
+            space = Image(height, width, channels)
+    if not isinstance(space, kinds):
+        raise ValueError(f"{name}: expected a {' or '.join(kind.__name__.lower() for kind in kinds)} space, got {entry!r:.80}")
+    return space
+
+
+def _whole(*numbers: Any) -> bool:
+    return all(type(number) is int for number in numbers)

@@ -1,6 +1,8 @@
 """The commands beside training: `train NAME ...` calls `main(arguments)` of the module of that name."""
 
-# name -> what it does, for --help
-COMMANDS: dict[str, str] = {
-    "report": "one HTML page about one run or many: train report LOGDIR... [--out FILE]",
+COMMANDS: dict[str, str] = {  # name -> what it does, for --help
+    "eval": "plays episodes with a checkpoint, on either backend",
+    "export": "writes the policy of a checkpoint as a folder that runs with NumPy alone",
+    "inspect": "what a train step met whose loss or gradient was not finite; what a checkpoint holds",
+    "report": "one HTML page about one run or many",
 }
