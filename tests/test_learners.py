@@ -160,7 +160,7 @@ def test_a_state_comes_out_as_it_went_in_through_a_file(learner: Learner) -> Non
 @pytest.mark.covers("AGT-9")
 def test_a_checkpoint_of_a_float64_run_is_float32(backend: str, tmp_path: Path) -> None:
     state = make(backend, 0, TASK, small_config("paper", "float64")).state_dict()
-    path = checkpoint.save(tmp_path, 0, state, {}, {})
+    path = checkpoint.save(tmp_path, 0, state, {}, {}, keep=1)
     types = {array.dtype.name for array in load_file(path / "learner.safetensors").values()}
     assert types == {"float32", "int64"}
 

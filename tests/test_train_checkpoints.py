@@ -142,7 +142,7 @@ def test_a_checkpoint_is_complete_or_absent(make: Make, monkeypatch: pytest.Monk
         raise OSError("disk full")
 
     with monkeypatch.context() as patch:
-        patch.setattr(checkpoint, "_flush_to_disk", fail)
+        patch.setattr("train.files.flush", fail)
         with pytest.raises(UserError, match="disk full"):
             loop.run(make(steps=90), FakeLearner)
     assert checkpoint.open_checkpoint(make().logdir) == before

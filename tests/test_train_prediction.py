@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from PIL import Image as Pillow
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from tensorboard.summary.writer.event_file_writer import EventFileWriter
 from train_fakes import FakeLearner
 
 from conformance.problems import random_actions, random_observations, random_parameters, small_config, spaces
@@ -16,7 +15,8 @@ from spec import Discrete, Image, Spaces, Vector
 from train.backend import Learner, learner_class
 from train.envs import Environments, make_env
 from train.evaluation import play
-from train.pictures import draw_predictions, picture_event
+from train.logger import Logger
+from train.pictures import draw_predictions
 from train.prediction import CONTEXT, ROWS, STEPS, SequenceRecorder, predict, prediction_errors
 
 ACTIONS = {"action": Discrete((2,))}
@@ -308,9 +308,10 @@ def test_a_right_prediction_of_a_signal_hides_the_truth_and_a_wrong_one_does_not
 def test_tensorboard_shows_the_animation(tmp_path: Path) -> None:
     task = Spaces({"camera": Image(8, 8, 3)}, ACTIONS)
     path = draw_predictions(tmp_path / "predictions", 40, task, *sequences_of(task, 8))["camera"]
-    writer = EventFileWriter(str(tmp_path / "events"))
-    writer.add_event(picture_event("prediction/camera", path, 40))
-    writer.close()
+    (tmp_path / "events").mkdir()
+    logger = Logger(tmp_path / "events")
+    logger.picture("prediction/camera", path, 40)
+    logger.close()
     events = EventAccumulator(str(tmp_path / "events"))
     events.Reload()
     (event,) = events.Images("prediction/camera")

@@ -8,9 +8,7 @@ LOGDIR/checkpoints/<environment step>/
 """
 
 import dataclasses
-import hashlib
 import json
-import os
 import re
 import shutil
 from collections.abc import Mapping
@@ -19,16 +17,14 @@ from typing import Any
 
 import numpy as np
 from safetensors import SafetensorError
-from safetensors.numpy import load_file, save_file
+from safetensors.numpy import save_file
 
 from train.errors import UserError
+from train.files import SUMS, Arrays, flush, read_arrays, read_json, require_intact, seal
 
 FORMAT = 3
 OURS = re.compile(r"\d{12}(\.tmp|\.old)?")  # .tmp: being written; .old: about to be replaced by the same step
 FILES = ("learner.safetensors", "loop.safetensors", "run.json")
-SUMS = "SHA256SUMS"
-
-Arrays = dict[str, np.ndarray]
 
 
 class Damaged(UserError):
@@ -70,14 +66,11 @@ def save(logdir: Path, step: int, learner: Mapping[str, Any], loop: Mapping[str,
         save_file(_contiguous(_single_precision(learner)), temporary / "learner.safetensors")
         save_file(_contiguous(loop), temporary / "loop.safetensors")
         (temporary / "run.json").write_text(json.dumps({"format": FORMAT, **info}, indent=2) + "\n", encoding="utf-8")
-        sums = "".join(f"{_sha256(temporary / name)}  {name}\n" for name in FILES)
-        (temporary / SUMS).write_text(sums, encoding="ascii")
-        for path in (*temporary.iterdir(), temporary):
-            _flush_to_disk(path)
+        seal(temporary, FILES)
         if final.exists():  # The same step again, as before and after the last evaluation.
             final.rename(directory / f"{name_of(step)}.old")
         temporary.rename(final)
-        _flush_to_disk(directory)
+        flush(directory)
         kept = [path for path in candidates(logdir) if path.suffix == ""][:keep]
         for other in directory.iterdir():
             if other not in kept and OURS.fullmatch(other.name):
@@ -120,13 +113,12 @@ def open_checkpoint(path: Path) -> Checkpoint:
             raise UserError(f"no checkpoint in {path}; expected a log directory of `train`, or one of the folders in its checkpoints/")
         path = found[0]
     try:
-        info = json.loads((path / "run.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise Damaged(f"the checkpoint {path} is damaged: run.json: {error}") from error
-    version = info.get("format") if isinstance(info, dict) else None
-    if version != FORMAT:
-        raise UserError(f"the checkpoint {path} has format {version}; this version reads format {FORMAT}")
-    _require_intact(path)
+        info = read_json(path / "run.json")
+        if info.get("format") != FORMAT:
+            raise UserError(f"the checkpoint {path} has format {info.get('format')}; this version reads format {FORMAT}")
+        require_intact(path, FILES)
+    except (OSError, ValueError) as error:
+        raise Damaged(f"the checkpoint {path} is damaged: {error}") from error
     return Checkpoint(path, info)
 
 
@@ -162,23 +154,6 @@ def _show(value: Any) -> str:
     return json.dumps(value) if isinstance(value, dict | list) else str(value)
 
 
-def _require_intact(path: Path) -> None:
-    try:
-        lines = (path / SUMS).read_text(encoding="ascii").splitlines()
-        if [line[66:] for line in lines] != list(FILES):
-            raise Damaged(f"the checkpoint {path} is damaged: {SUMS} does not list {', '.join(FILES)}")
-        for line, name in zip(lines, FILES, strict=True):
-            if _sha256(path / name) != line[:64]:
-                raise Damaged(f"the checkpoint {path} is damaged: {name} does not have the checksum in {SUMS}")
-    except (OSError, ValueError) as error:
-        raise Damaged(f"the checkpoint {path} is damaged: {error}") from error
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
 def _single_precision(arrays: Mapping[str, Any]) -> Arrays:
     """[AGT-9]: a checkpoint is float32, also of a run that computes in float64."""
     return {name: np.asarray(array, np.float32 if np.asarray(array).dtype == np.float64 else None) for name, array in arrays.items()}
@@ -190,17 +165,6 @@ def _contiguous(arrays: Mapping[str, Any]) -> Arrays:
 
 def _read_arrays(path: Path) -> Arrays:
     try:
-        return load_file(path)
-    except (OSError, SafetensorError) as error:
-        raise Damaged(f"the checkpoint file {path} is damaged: {error}") from error
-
-
-def _flush_to_disk(path: Path) -> None:
-    """A file's content, or which names a folder holds."""
-    if path.is_dir() and os.name == "nt":  # Windows flushes folders by itself and does not open them.
-        return
-    descriptor = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+        return read_arrays(path)
+    except (OSError, ValueError) as error:
+        raise Damaged(f"the checkpoint {path.parent} is damaged: {error}") from error

@@ -70,7 +70,7 @@ class Parser(argparse.ArgumentParser):
     """Mistakes are UserErrors."""
 
     def error(self, message: str) -> NoReturn:
-        raise UserError(f"{message} (see train --help)")
+        raise UserError(f"{message} (see {self.prog} --help)")
 
 
 class _Formatter(argparse.RawDescriptionHelpFormatter):

@@ -1,7 +1,7 @@
 """Episodes that are played but not learned from: evaluation of the agent, and what a random policy gets."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,12 +15,24 @@ LONGEST_EPISODE = 108_000  # records
 Act = Callable[[Record], np.ndarray]
 
 
+class Episode(NamedTuple):
+    """score: the sum of the rewards, undiscounted. length: in records, the reset's included."""
+
+    score: float
+    length: int
+
+
 class Interrupted(Exception):
     """Somebody asked the run to end."""
 
 
 def play(envs: Environments, act: Act, episodes: int, seeds: list[int], interrupted: Sequence[int] = ()) -> list[float]:
-    """The returns of `episodes` whole episodes, undiscounted: [LOOP-20].
+    """The returns of `episodes` whole episodes, as `play_episodes` plays them."""
+    return [episode.score for episode in play_episodes(envs, act, episodes, seeds, interrupted)]
+
+
+def play_episodes(envs: Environments, act: Act, episodes: int, seeds: list[int], interrupted: Sequence[int] = ()) -> list[Episode]:
+    """Scores and lengths of `episodes` whole episodes: [LOOP-20].
 
     Each environment plays its share. The first `episodes` to end, wherever they do, would be the short ones.
 
@@ -29,20 +41,21 @@ def play(envs: Environments, act: Act, episodes: int, seeds: list[int], interrup
       Interrupted: `interrupted` is no longer empty.
     """
     share = np.full(envs.count, episodes // envs.count) + (np.arange(envs.count) < episodes % envs.count)
-    returns: list[list[float]] = [[] for _ in range(envs.count)]
+    played: list[list[Episode]] = [[] for _ in range(envs.count)]
     total, length = np.zeros(envs.count), np.zeros(envs.count, int)
     record = envs.reset(seeds)
     while True:
         total = np.where(record["is_first"], 0.0, total) + record["reward"]
         length = np.where(record["is_first"], 0, length) + 1
         for worker in np.flatnonzero(record["is_last"]):
-            if len(returns[worker]) < share[worker]:
-                returns[worker].append(float(total[worker]))
-        if all(len(scores) == wanted for scores, wanted in zip(returns, share, strict=True)):
-            return [score for scores in returns for score in scores]
+            if len(played[worker]) < share[worker]:
+                played[worker].append(Episode(float(total[worker]), int(length[worker])))
+        unfinished = [len(ended) < wanted for ended, wanted in zip(played, share, strict=True)]
+        if not any(unfinished):
+            return [episode for ended in played for episode in ended]
         if interrupted:
             raise Interrupted
-        if length[[len(scores) < wanted for scores, wanted in zip(returns, share, strict=True)]].max() > LONGEST_EPISODE:
+        if length[unfinished].max() > LONGEST_EPISODE:
             raise UserError(
                 f"an episode did not end within {LONGEST_EPISODE:,} steps, so it has no return; give the environment a time limit "
                 "(gymnasium.wrappers.TimeLimit), or --eval-episodes 0 --random-episodes 0"

@@ -17,8 +17,6 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from PIL import Image as Pillow
 from PIL import ImageColor, ImageDraw, ImageFont
-from tensorboard.compat.proto.event_pb2 import Event
-from tensorboard.compat.proto.summary_pb2 import Summary
 
 from reference_numpy.transforms import symlog
 from spec import Discrete, Spaces, Vector
@@ -60,17 +58,6 @@ def draw_predictions(
     paths["signals"] = directory / f"{step:012d}-signals.png"
     _draw_signals(signals, starts[longest[0]], context, f"step {step:,}").savefig(paths["signals"])
     return paths
-
-
-def picture_event(tag: str, path: Path, step: int) -> Event:
-    """The picture file as TensorBoard shows it among the images, an animation included; for an `EventFileWriter`.
-
-    `tensorboard.summary.Writer` knows scalars only.
-    """
-    with Pillow.open(path) as picture:
-        width, height = picture.size
-    image = Summary.Image(width=width, height=height, colorspace=3, encoded_image_string=path.read_bytes())
-    return Event(step=step, summary=Summary(value=[Summary.Value(tag=tag, image=image)]))
 
 
 def _longest_episodes(is_first: np.ndarray) -> np.ndarray:

@@ -1,0 +1,32 @@
+"""Checkpoints of agents with random parameters, for the tests of what is made of a checkpoint."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from conformance.problems import random_state
+from reference_numpy.agent import flatten_state
+from spec import Config, Spaces
+from train import checkpoint
+from train.options import Options
+from train.state import Counters
+
+
+def random_learner_state(config: Config, spaces: Spaces, seed: int = 0) -> dict[str, np.ndarray]:
+    """A training state in the middle of training, under the names of a checkpoint; no parameter is zero."""
+    return flatten_state(random_state(np.random.default_rng(seed), config, spaces, "float32"))
+
+
+def save_checkpoint(logdir: Path, config: Config, spaces: Spaces, *, backend: str = "jax", seed: int = 0, **given: Any) -> Path:
+    """Writes a checkpoint at step 1000. given: fields of Options."""
+    options = Options(backend=backend, config=config, logdir=logdir, steps=1000, seed=seed, **given)
+    info = {
+        "identity": options.identity(),
+        "spaces": spaces.to_json(),
+        "backend": backend,
+        "counters": dataclasses.asdict(Counters(records=1000 // options.action_repeat, train_steps=10)),
+    }
+    loop = {"drawn/reward": np.zeros((2, 3), np.float32), "carry/action": np.zeros((2, spaces.action_size), np.float32)}
+    return checkpoint.save(logdir, 1000, random_learner_state(config, spaces, seed), loop, info, keep=2)

@@ -1,0 +1,156 @@
+"""`train eval CHECKPOINT --episodes N`: plays episodes with the agent of a checkpoint, on either backend."""
+
+import argparse
+import functools
+import json
+import math
+import statistics
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from reference_numpy.training_loop import derive_seed
+from train.backend import Learner
+from train.checkpoint import open_checkpoint
+from train.cli import Parser
+from train.envs import Environments, Record, is_slow, make_env
+from train.errors import UserError
+from train.evaluation import Agent, Episode, play_episodes
+from train.options import Options
+from train.saved_agent import SavedAgent, agent_of
+from train.setup import _import_learner, _make_learner
+
+BACKENDS = ("jax", "torch")
+DESCRIPTION = """Play episodes with the agent of a checkpoint. It samples its actions, as in training.
+
+  train eval runs/CartPole-v1-jax-seed0 --episodes 100
+  train eval runs/CartPole-v1-jax-seed0/checkpoints/000000020000 --episodes 100 --backend torch --json returns.json"""
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Runs the command. Returns the exit code.
+
+    Raises:
+      UserError: a wrong option, a checkpoint that cannot be read, an environment that does not fit it, a file that cannot be written.
+    """
+    values = _parse(arguments)
+    checkpoint = open_checkpoint(values.checkpoint)
+    saved = agent_of(checkpoint)  # Before a learner is made: it has looked at the sizes.
+    options = Options(
+        backend=values.backend or _trained_last(saved),
+        task=values.task or _task_without_code(saved),
+        config=saved.config,
+        logdir=checkpoint.path,
+        steps=0,
+        seed=derive_seed(values.seed, "separate_evaluation", 0),
+        device=values.device,
+        action_repeat=saved.info["action_repeat"],
+        image_size=saved.info["image_size"],
+    )
+    learner_type = _import_learner(options.backend)
+    make = functools.partial(make_env, options.task, image_size=options.image_size, action_repeat=options.action_repeat)
+    count = min(saved.config.envs, values.episodes)
+    with closing(Environments(make, count, count > 1 and is_slow(make, options.seed))) as envs:
+        if envs.spaces != saved.spaces:
+            raise UserError(f"the task {options.task} has the spaces {envs.spaces}; the agent of {checkpoint.path} has {saved.spaces}")
+        learner = _make_learner(learner_type, options, saved.spaces)
+        try:
+            learner.load_state_dict(checkpoint.learner)
+        except ValueError as error:
+            raise UserError(f"the checkpoint {checkpoint.path} does not fit this version: {error}") from error
+        episodes = play(learner, envs, values.episodes, options.seed)
+    summary = summarize(episodes)
+    where = f"{options.backend} on {learner.device}"
+    print(f"{checkpoint.path}: {options.task}, step {saved.info['step']:,}; {len(episodes)} episodes with {where}, seed {values.seed}")
+    print(sentence(summary))
+    if values.json:
+        run = {"checkpoint": str(checkpoint.path), "task": options.task, "step": saved.info["step"], "trained_by": saved.info["backend"]}
+        run |= {"backend": options.backend, "device": learner.device, "seed": values.seed}
+        lists = {"returns": [episode.score for episode in episodes], "lengths": [episode.length for episode in episodes]}
+        _write(values.json, {**run, **summary, **lists})
+    return 0
+
+
+def play(learner: Learner, envs: Environments, episodes: int, seed: int) -> list[Episode]:
+    """Whole episodes of the learner, with the seeds of a run's first evaluation. seed: takes the place of the run's. [LOOP-19], [LOOP-26]
+
+    Raises:
+      UserError: an action that is not finite, or an episode that does not end.
+    """
+    agent = Agent(learner, envs, seed, 0)
+
+    def act(record: Record) -> np.ndarray:
+        action = np.asarray(agent(record), np.float32)
+        if not np.isfinite(action).all():  # [LOOP-12]
+            raise UserError(f"at policy step {agent.step} the action is not finite: the parameters of the checkpoint are broken")
+        return action
+
+    return play_episodes(envs, act, episodes, [derive_seed(seed, "evaluation_environment", worker) for worker in range(envs.count)])
+
+
+def summarize(episodes: Sequence[Episode]) -> dict[str, float | None]:
+    """The standard error is that of the mean, from the sample's standard deviation; None for one episode."""
+    scores, lengths = [episode.score for episode in episodes], [episode.length for episode in episodes]
+    return {
+        "return": statistics.fmean(scores),
+        "return_standard_error": statistics.stdev(scores) / math.sqrt(len(scores)) if len(scores) > 1 else None,
+        "return_min": min(scores),
+        "return_max": max(scores),
+        "length": statistics.fmean(lengths),
+        "length_min": min(lengths),
+        "length_max": max(lengths),
+    }
+
+
+def sentence(summary: Mapping[str, float | None]) -> str:
+    """return 187.3 ± 4.2 (min 120, max 200), length 188.3 (min 121, max 201)"""
+    error = summary["return_standard_error"]
+    shown = {name: f"{value:.4g}" for name, value in summary.items() if value is not None}
+    spread = "" if error is None else f" ± {error:.2g}"
+    return (
+        f"return {shown['return']}{spread} (min {shown['return_min']}, max {shown['return_max']}), "
+        f"length {shown['length']} (min {shown['length_min']}, max {shown['length_max']})"
+    )
+
+
+def _parse(arguments: Sequence[str]) -> argparse.Namespace:
+    parser = Parser(prog="train eval", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False)
+    parser.add_argument("checkpoint", type=Path, help="a log directory (its newest checkpoint), or one of the folders in its checkpoints/")
+    parser.add_argument("--episodes", type=int, required=True, metavar="N", help="how many")
+    parser.add_argument("--backend", choices=BACKENDS, help="which implementation acts (default: the one that trained last)")
+    parser.add_argument("--device", metavar="NAME", help="cpu, gpu, cuda:1, ... (default: the backend's choice)")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of environments and actions; never those of the run (default 0)")
+    parser.add_argument(
+        "--task", metavar="SUITE:NAME", help="play this task instead; needed where the checkpoint names a module, whose code would run"
+    )
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the summary and every return and length")
+    values = parser.parse_args(arguments)
+    if values.episodes < 1 or values.seed < 0:
+        parser.error(f"expected at least one episode and a seed of at least 0, got {values.episodes} and {values.seed}")
+    return values
+
+
+def _trained_last(saved: SavedAgent) -> str:
+    backend: str = saved.info["backend"]
+    if backend not in BACKENDS:
+        raise UserError(f"the checkpoint was trained by the unknown backend {backend!r}; choose one with --backend")
+    return backend
+
+
+def _task_without_code(saved: SavedAgent) -> str:
+    """A checkpoint may come from anywhere, so it alone does not decide which modules are imported."""
+    task: str = saved.info["task"]
+    suite, _, name = task.partition(":")
+    if suite in ("gym", "dmc", "dmc_vision") and ":" not in name:
+        return task
+    raise UserError(f"the checkpoint names the task {task}, which runs code of that module; if you trust it, add --task {task}")
+
+
+def _write(path: Path, content: Mapping[str, Any]) -> None:
+    try:
+        path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise UserError(f"cannot write {path}: {error.strerror}") from error
