@@ -17,19 +17,10 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from benchmarks.machine import describe
+from train.machine import describe
 
 Part = tuple[str, list[str]]
 GRACE = 20.0  # seconds that an interrupted training has for its checkpoint
-
-
-def accelerator() -> str | None:
-    """Name and memory of the first NVIDIA device."""
-    try:
-        command = ["nvidia-smi", "--query-gpu=name,memory.total,driver_version", "--format=csv,noheader"]
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip().splitlines()[0]
-    except (OSError, subprocess.CalledProcessError, IndexError):
-        return None
 
 
 def stages(out: Path, backends: list[str], device: str | None, small: bool) -> list[list[Part]]:
@@ -38,7 +29,7 @@ def stages(out: Path, backends: list[str], device: str | None, small: bool) -> l
 
     def conformance(backend: str, dtype: str) -> Part:
         name = f"conformance-{backend}-{dtype}"
-        kit = ["-m", "conformance.cli", "run", "--backend", backend, "--dtype", dtype, "--examples", "5", *where]
+        kit = ["-m", "conformance.cli", "check", backend, "--dtype", dtype, "--examples", "5", *where]
         return name, [*kit, "--json", str(out / f"{name}.json")]
 
     def train_step(backend: str, size: str) -> Part:
@@ -93,8 +84,8 @@ def main() -> int:
     deadline = time.monotonic() + 60 * options.minutes
     everything = stages(options.out, options.backends, options.device, options.small)
     selected = [found for stage in everything if (found := [part for part in stage if options.only in part[0]])]
-    report: dict[str, Any] = {"accelerator": accelerator(), "machine": describe(), "parts": []}
-    print(json.dumps({key: report[key] for key in ("accelerator", "machine")}))
+    report: dict[str, Any] = {"machine": describe(), "parts": []}
+    print(json.dumps(report["machine"]))
     for index, stage in enumerate(selected):
         left = deadline - time.monotonic()
         # A stage may take what is left, but leaves a third of an equal share to each one after it.

@@ -20,9 +20,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, FormatStrFormatter
 
-from benchmarks.machine import command, describe
+from benchmarks.machine import command
 from train.curve import BLUE, GRAY, ORANGE
 from train.logger import read_metrics
+from train.machine import describe
 
 COLORS = {"jax": BLUE, "torch": ORANGE}
 EVALUATION, EPISODES = "evaluation/return", "episode/return"

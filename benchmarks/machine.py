@@ -1,27 +1,10 @@
-"""What machine a number was measured on."""
+"""The command that is running, and how fast the machine is today. What machine it is: train/machine.py."""
 
-import importlib.metadata
-import os
-import platform
 import shlex
-import subprocess
 import sys
 import time
 
 import numpy as np
-
-
-def describe() -> dict[str, object]:
-    """Processor, cores, memory, versions and the commit, in plain JSON types."""
-    return {
-        "processor": _processor(),
-        "cores": os.cpu_count(),
-        "memory_gib": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1),
-        "python": platform.python_version(),
-        "versions": {name: _version(name) for name in ("numpy", "jax", "torch")},
-        "commit": _commit(),
-        "date": time.strftime("%Y-%m-%d"),
-    }
 
 
 def command(module: str) -> str:
@@ -38,26 +21,3 @@ def matrix_rate(size: int = 2048, repeats: int = 5) -> float:
         a @ a
         times.append(time.perf_counter() - start)
     return 2 * size**3 / min(times) / 1e9
-
-
-def _processor() -> str:
-    try:
-        with open("/proc/cpuinfo", encoding="utf-8") as file:
-            return next(line.split(":", 1)[1].strip() for line in file if line.startswith("model name"))
-    except (OSError, StopIteration):
-        return platform.processor() or platform.machine()
-
-
-def _version(name: str) -> str | None:
-    try:
-        return importlib.metadata.version(name)
-    except importlib.metadata.PackageNotFoundError:
-        return None
-
-
-def _commit() -> str | None:
-    try:
-        result = subprocess.run(["git", "describe", "--always", "--dirty"], capture_output=True, text=True, check=True)
-    except (OSError, subprocess.CalledProcessError):
-        return None
-    return result.stdout.strip()

@@ -22,7 +22,8 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.machine import command, describe
+from benchmarks.machine import command
+from train.machine import describe
 from train.replay import Replay
 
 WORKERS, ROWS, LENGTH = 16, 16, 64

@@ -16,9 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.machine import command, describe, matrix_rate
+from benchmarks.machine import command, matrix_rate
 from spec import Config, Image, Spaces, Vector, load_config
 from train.backend import learner_class
+from train.machine import describe
 
 OBSERVATIONS = {"vector": {"vector": Vector(24)}, "image": {"image": Image(64, 64, 3)}}
 

@@ -83,6 +83,17 @@ class Adapter(Protocol):
     def continue_target(self, is_terminal: Array, config: Config) -> Array: ...
     def kl_losses(self, posterior_logits: Array, prior_logits: Array, config: Config) -> tuple[Array, Array]: ...
     def reconstruction_losses(self, predictions: Arrays, observations: Arrays, spaces: Spaces, config: Config) -> Arrays: ...
+    def open_loop(
+        self,
+        params: Arrays,
+        observation: Arrays,
+        prev_action: Array,
+        is_first: Array,
+        context: int,
+        noise: Arrays,
+        spaces: Spaces,
+        config: Config,
+    ) -> Arrays: ...
 
     # returns
     def lambda_return(self, reward: Array, continue_: Array, value: Array, discount: float, lambda_: float) -> Array: ...

@@ -18,6 +18,7 @@ from conformance.check import Check
 from conformance.execute import Result, run_check
 from reference_numpy import behavior, distributions, layers, optimizer, returns, rssm, transforms, world_model
 from reference_numpy.stop_gradient import stop_gradient
+from spec import Vector
 
 Function = Callable[..., Any]
 
@@ -301,6 +302,44 @@ def kl_stop_gradients_swapped(posterior_logits: Any, prior_logits: Any, config: 
 @mutant("the continue head is trained on is_last, so that a time limit counts as an end", "world_model.world_model_losses")
 def continue_trained_on_is_last(params: Any, batch: Any, states: Any, spaces: Any, config: Any) -> Any:
     return _world_model_losses(params, {**batch, "is_terminal": batch["is_last"]}, states, spaces, config)
+
+
+_open_loop = world_model.open_loop
+
+
+def _with_context(context: int, arguments: tuple[Any, ...]) -> Any:
+    """The right prediction with another number of context steps, from the same uniforms."""
+    params, observation, prev_action, is_first, _, noise, spaces, config = arguments
+    uniform = np.concatenate([noise["posterior"], noise["prior"]], 1)
+    noise = {"posterior": uniform[:, :context], "prior": uniform[:, context:]}
+    return _open_loop(params, observation, prev_action, is_first, context, noise, spaces, config)
+
+
+@mutant("open loop that goes on looking at the observations", "world_model.open_loop")
+def open_loop_sees_everything(*arguments: Any) -> Any:
+    return _with_context(np.shape(arguments[3])[1] - 1, arguments)
+
+
+@mutant("open loop with a context one step too long", "world_model.open_loop")
+def open_loop_context_off_by_one(*arguments: Any) -> Any:
+    return _with_context(min(arguments[4] + 1, np.shape(arguments[3])[1] - 1), arguments)
+
+
+@mutant("open loop with the action taken after each observation", "world_model.open_loop")
+def open_loop_actions_shifted(params: Any, observation: Any, prev_action: Any, *others: Any) -> Any:
+    return _open_loop(params, observation, np.roll(prev_action, -1, axis=1), *others)
+
+
+@mutant("open loop without resets after the context", "world_model.open_loop")
+def open_loop_without_resets(params: Any, observation: Any, prev_action: Any, is_first: Any, context: int, *others: Any) -> Any:
+    is_first = np.asarray(is_first) & (np.arange(np.shape(is_first)[1]) < context)
+    return _open_loop(params, observation, prev_action, is_first, context, *others)
+
+
+@mutant("open loop that leaves vectors in symlog space", "world_model.open_loop")
+def open_loop_in_symlog_space(*arguments: Any) -> Any:
+    vectors = {key for key, space in arguments[6].observations.items() if isinstance(space, Vector)}
+    return {key: transforms.symlog(value) if key in vectors else value for key, value in _open_loop(*arguments).items()}
 
 
 # --- Recurrent model -------------------------------------------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ A part stands between a marker line and an end line, and is never edited by hand
 
   <!-- quote: reference_numpy/returns.py lambda_return -->      the source of a function or class
   <!-- end quote -->
-  <!-- table: hyperparameters -->                               one of TABLES
+  <!-- table: hyperparameters -->                               one of TABLES, each a table or more
   <!-- end table -->
 """
 
@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from spec import benchmarks, hyperparameters, profiles, sizes
+from train.report import catalogue
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "docs" / "results"
@@ -75,10 +76,10 @@ def benchmark_table() -> str:
 
 
 def conformance_runs() -> dict[tuple[str, str, str], dict[str, Any]]:
-    """The committed runs of the kit: (backend, dtype, profile) -> report of `conformance run --json`."""
+    """The committed runs of the kit: (candidate, dtype, profile) -> report of `conformance check --json`."""
     reports = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(RESULTS.glob("conformance-*.json"))]
     order = ("jax", "torch", "float64", "float32", "bfloat16", "paper", "official")
-    keyed = {(report["backend"], report["dtype"], report["profile"]): report for report in reports}
+    keyed = {(report["candidate"], report["dtype"], report["profile"]): report for report in reports}
     return dict(sorted(keyed.items(), key=lambda item: tuple(map(order.index, item[0]))))
 
 
@@ -164,6 +165,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "mutants": mutant_table,
     "train_step": train_step_table,
     "learning": learning_table,
+    "metrics": catalogue.markdown,
 }
 
 

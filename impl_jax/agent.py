@@ -222,18 +222,32 @@ def _imagine_batch(constants: Params, states: Arrays, noise: Arrays, spaces: Spa
     return rssm.imagine_features(constants, carry, policy, uniform, config)
 
 
+def gradients(
+    params: Params,
+    slow_critic: Arrays,
+    return_range: tuple[ArrayLike, ArrayLike],
+    batch: Arrays,
+    noise: Arrays,
+    spaces: Spaces,
+    config: Config,
+) -> tuple[dict[str, jax.Array], jax.Array, dict[str, Any]]:
+    """The gradient of the total by every parameter, and what `losses` returns: (gradients, total, aux). [AGT-28]"""
+
+    def total(params: Params) -> tuple[jax.Array, dict[str, Any]]:
+        return losses(params, slow_critic, return_range, batch, noise, spaces, config)
+
+    (loss, aux), by_name = jax.value_and_grad(total, has_aux=True)(params)
+    return by_name, loss, aux
+
+
 def train_step(state: State, batch: Arrays, noise: Arrays, spaces: Spaces, config: Config) -> tuple[State, dict[str, Any]]:
     """One gradient step: (new state, aux of `losses` with the optimizer's metrics beside the others). [AGT-29] to [AGT-31]
 
     The returned latents are those of the parameters before the update.
     """
     return_range = (state["return_range"]["low"], state["return_range"]["high"])
-
-    def total(params: Params) -> tuple[jax.Array, dict[str, Any]]:
-        return losses(params, state["slow_critic"], return_range, batch, noise, spaces, config)
-
-    (loss, aux), gradients = jax.value_and_grad(total, has_aux=True)(state["params"])
-    params, optimizer, metrics = optimizer_step_with_metrics(state["params"], gradients, state["optimizer"], config)
+    by_name, loss, aux = gradients(state["params"], state["slow_critic"], return_range, batch, noise, spaces, config)
+    params, optimizer, metrics = optimizer_step_with_metrics(state["params"], by_name, state["optimizer"], config)
     low, high = aux["return_range"]
     new = {
         "params": params,

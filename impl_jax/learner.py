@@ -11,8 +11,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from impl_jax import agent
+from impl_jax import agent, world_model
+from impl_jax.checks import require
 from impl_jax.layers import compute_dtype, exact_dtype
+from impl_jax.optimizer import norm
 from spec import Config, Discrete, Spaces, parameter_table
 
 Arrays = Mapping[str, np.ndarray]
@@ -21,23 +23,27 @@ Arrays = Mapping[str, np.ndarray]
 class Learner:
     """An agent on one device.
 
-    seed: of the initial parameters. device: see `select_device`.
+    seed: of the initial parameters. device: see `select_device`. nonfinite: "stop" or "skip", [LOOP-40] to [LOOP-42].
 
     Raises:
-      ValueError: an unknown device, or one that this installation of JAX does not have.
+      ValueError: an unknown device, or one that this installation of JAX does not have, or another word for `nonfinite`.
     """
 
     def __init__(self, spaces: Spaces, config: Config, *, seed: int, device: str | None = None, nonfinite: str = "stop") -> None:
+        require(nonfinite in ("stop", "skip"), "nonfinite", "'stop' or 'skip'", nonfinite)
         if config.compute_dtype == "float64":
             jax.config.update("jax_enable_x64", True)
-        self.spaces, self.config = spaces, config
+        self.spaces, self.config, self._nonfinite = spaces, config, nonfinite
         self._device = select_device(device)
         self.device = ":".join([self._device.platform, *(device or "").split(":")[1:]])
         with jax.default_device(self._device):
             state = jax.jit(_initial_state, static_argnums=1)(np.uint32(seed), _Static(spaces, config))
         self._state = jax.device_put(state, self._device)
+        self._stopped = self._flag(False)  # on the device: no train step waits for the one before
         self._policy = jax.jit(self._policy_function)
         self._train = jax.jit(self._train_function, donate_argnums=0)
+        self._gradients = jax.jit(self._gradients_function)
+        self._predict = jax.jit(self._predict_function, static_argnums=4)
         self._batch_keys = (*spaces.observations, "reward", "is_first", "is_last", "is_terminal", "prev_action", "deter", "stoch")
 
     def initial_carry(self, envs: int) -> Any:
@@ -74,16 +80,31 @@ class Learner:
         return np.asarray(carry["action"]), latents, carry
 
     def train_step(self, batch: Arrays, seed: int) -> tuple[Mapping[str, Any], Arrays]:
-        """One gradient step with the random numbers of a seed. [AGT-29], [AGT-30]
+        """One gradient step with the random numbers of a seed. [AGT-29], [AGT-30], [LOOP-40] to [LOOP-42]
 
         Returns metrics by name and the latents to write back, which may still be computing.
         """
-        missing = [key for key in self._batch_keys if key not in batch]
-        if missing:
-            raise ValueError(f"the train batch lacks {', '.join(missing)}; it has {', '.join(sorted(batch))}")
-        inputs = jax.device_put({key: batch[key] for key in self._batch_keys}, self._device)
-        self._state, metrics, latents = self._train(self._state, inputs, np.uint32(seed))
+        inputs = self._inputs(batch)
+        self._state, skipped, metrics, latents = self._train(self._state, self._stopped, inputs, np.uint32(seed))
+        if self._nonfinite == "stop":
+            self._stopped = skipped
         return {name: _Element(metrics.values, index) for index, name in enumerate(metrics.names)}, latents
+
+    def gradients(self, batch: Arrays, seed: int) -> tuple[dict[str, float], dict[str, np.ndarray]]:
+        """The metrics and the gradient of every parameter that a train step would compute now. Changes nothing. [LOOP-44]"""
+        metrics, gradients = self._gradients(self._state, self._inputs(batch), np.uint32(seed))
+        numbers = dict(zip(metrics.names, np.asarray(metrics.values).tolist(), strict=True))
+        return numbers, {name: np.array(gradient) for name, gradient in gradients.items()}
+
+    def predict(self, observation: Arrays, prev_action: np.ndarray, is_first: np.ndarray, context: int, seed: int) -> dict[str, np.ndarray]:
+        """The open-loop prediction of recorded sequences, with the random numbers of a seed. [WM-20] to [WM-24]
+
+        observation: key -> [B, T, ...]; prev_action [B, T, A]; is_first [B, T].
+        """
+        inputs = {key: np.asarray(observation[key]) for key in self.spaces.observations if key in observation}
+        inputs, prev_action, is_first = jax.device_put((inputs, np.asarray(prev_action), np.asarray(is_first, bool)), self._device)
+        predictions = self._predict(self._state["params"], inputs, prev_action, is_first, context, np.uint32(seed))
+        return {key: np.asarray(value) for key, value in predictions.items()}
 
     def state_dict(self) -> dict[str, np.ndarray]:
         """The training state under its canonical names. [AGT-8], [AGT-9]"""
@@ -110,6 +131,16 @@ class Learner:
         # Copies, because the next train step reuses the memory of the state.
         new = {name: np.array(state[name], value.dtype) for name, value in current.items()}
         self._state = jax.device_put(_unflatten(new), self._device)
+        self._stopped = self._flag(False)
+
+    def _flag(self, value: bool) -> jax.Array:
+        return jax.device_put(np.asarray(value), self._device)
+
+    def _inputs(self, batch: Arrays) -> dict[str, jax.Array]:
+        missing = [key for key in self._batch_keys if key not in batch]
+        if missing:
+            raise ValueError(f"the train batch lacks {', '.join(missing)}; it has {', '.join(sorted(batch))}")
+        return jax.device_put({key: batch[key] for key in self._batch_keys}, self._device)
 
     def _policy_function(self, params: Any, carry: Any, observation: Any, is_first: jax.Array, seed: jax.Array) -> tuple[Any, Any]:
         shape = is_first.shape
@@ -118,15 +149,43 @@ class Learner:
         latents, action = agent.policy_step(params, latents, carry["action"], observation, is_first, noise, self.spaces, self.config)
         return latents | {"action": action}, self._stored(latents)
 
-    def _train_function(self, state: Any, batch: Any, seed: jax.Array) -> tuple[Any, Any, Any]:
+    def _train_function(self, state: Any, stopped: jax.Array, batch: Any, seed: jax.Array) -> tuple[Any, jax.Array, Any, Any]:
+        new, aux = agent.train_step(state, batch, self._train_noise(batch, seed), self.spaces, self.config)
+        metrics = {f"loss/{name}": mean for name, mean in aux["losses"].items()} | aux["metrics"]
+        finite = jnp.isfinite(metrics["loss/total"]) & jnp.isfinite(metrics["gradient_norm"])
+        applied = finite & ~stopped
+        state = jax.tree.map(lambda after, before: jnp.where(applied, after, before), new, state)
+        metrics |= {"update_norm": jnp.where(applied, metrics["update_norm"], 0.0), "skipped": ~applied}
+        return state, ~applied, self._packed(metrics), self._stored(aux)
+
+    def _gradients_function(self, state: Any, batch: Any, seed: jax.Array) -> tuple[Any, dict[str, jax.Array]]:
+        return_range = (state["return_range"]["low"], state["return_range"]["high"])
+        noise = self._train_noise(batch, seed)
+        gradients, total, aux = agent.gradients(state["params"], state["slow_critic"], return_range, batch, noise, self.spaces, self.config)
+        low, high = aux["return_range"]
+        metrics = {f"loss/{name}": mean for name, mean in aux["losses"].items()} | aux["metrics"]
+        metrics |= {"loss/total": total, "return_low": low, "return_high": high}
+        metrics["gradient_norm"] = norm(jnp.stack([norm(gradient) for gradient in gradients.values()]))
+        return self._packed(metrics), gradients
+
+    def _train_noise(self, batch: Any, seed: jax.Array) -> dict[str, jax.Array]:
+        """[CON-20]"""
         B, T = batch["is_first"].shape
         N, H, S = B * T, self.config.imagination_horizon, self.config.stoch
         uniforms = {"posterior": (B, T, S), "prior": (N, H, S)}
-        noise = _noise(seed, uniforms, (N, H), self.spaces, self.config)
-        state, aux = agent.train_step(state, batch, noise, self.spaces, self.config)
-        metrics = {f"loss/{name}": mean for name, mean in aux["losses"].items()} | aux["metrics"]
-        values = jnp.stack([value.astype(exact_dtype(self.config)) for value in metrics.values()])
-        return state, _Metrics(tuple(metrics), values), self._stored(aux)
+        return _noise(seed, uniforms, (N, H), self.spaces, self.config)
+
+    def _packed(self, metrics: Mapping[str, jax.Array]) -> "_Metrics":
+        return _Metrics(tuple(metrics), jnp.stack([value.astype(exact_dtype(self.config)) for value in metrics.values()]))
+
+    def _predict_function(
+        self, params: Any, observation: Any, prev_action: jax.Array, is_first: jax.Array, context: int, seed: jax.Array
+    ) -> dict[str, jax.Array]:
+        (B, T), key = is_first.shape, jax.random.key(seed)
+        shapes = {"posterior": (B, max(0, context), self.config.stoch), "prior": (B, max(0, T - context), self.config.stoch)}
+        dtype = exact_dtype(self.config)
+        noise = {name: jax.random.uniform(jax.random.fold_in(key, i), shape, dtype) for i, (name, shape) in enumerate(shapes.items())}
+        return world_model.open_loop(params, observation, prev_action, is_first, context, noise, self.spaces, self.config)
 
     def _stored(self, states: Any) -> dict[str, jax.Array]:
         """Latents as the replay buffer keeps them."""

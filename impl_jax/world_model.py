@@ -4,22 +4,26 @@ from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jax.lax import stop_gradient
 
 from impl_jax import networks, rssm
 from impl_jax.checks import require, require_same_shape, require_shape
 from impl_jax.distributions import (
     bernoulli_loss,
+    bernoulli_mean,
     categorical_kl,
     categorical_log_prob,
+    categorical_sample,
     mse_loss,
     symexp_twohot_loss,
+    symexp_twohot_mean,
     symlog_mse_loss,
     unimix_log_probs,
 )
-from impl_jax.layers import Params, exact_dtype
-from impl_jax.transforms import exponential_bins
-from spec import Config, Discrete, Image, Spaces
+from impl_jax.layers import Params, compute_dtype, exact_dtype
+from impl_jax.transforms import exponential_bins, symexp
+from spec import Config, Discrete, Image, Spaces, Vector
 
 Arrays = Mapping[str, jax.Array]
 
@@ -102,3 +106,69 @@ def world_model_losses(params: Params, batch: Arrays, states: Arrays, spaces: Sp
         "dynamics": dynamics,
         "representation": representation,
     }
+
+
+def open_loop(
+    params: Params,
+    observation: Arrays,
+    prev_action: jax.Array,
+    is_first: jax.Array,
+    context: int,
+    noise: Arrays,
+    spaces: Spaces,
+    config: Config,
+) -> dict[str, jax.Array]:
+    """What the model sees coming, from a few observations and then actions alone. [WM-20] to [WM-24]
+
+    observation: key -> [B, T, ...], of which the first `context` steps are read; prev_action [B, T, A]; is_first [B, T];
+    noise: {"posterior" [B, context, S], "prior" [B, T - context, S]}.
+
+    Returns:
+      By observation key [B, T, ...]: numbers in their own units, probabilities, images in [0, 1]; "reward" and "continue_" [B, T].
+
+    Raises:
+      ValueError: a missing key, a wrong shape or dtype, or a context that is not within the sequence.
+    """
+    require_shape("is_first", is_first, "B", "T")
+    B, T = is_first.shape
+    require(1 <= context < T, "context", f"1 to {T - 1} steps of {T}", context)
+    require_shape("prev_action", prev_action, B, T, spaces.action_size)
+    require_shape("noise posterior", noise["posterior"], B, context, config.stoch)
+    require_shape("noise prior", noise["prior"], B, T - context, config.stoch)
+    for key, space in spaces.observations.items():
+        require(key in observation, "observation", f"the key {key!r}", f"the keys {sorted(observation)}")
+        require_shape(f"observation {key!r}", observation[key], B, T, *space.array_shape)
+
+    tokens = networks.encoder(params, {key: observation[key][:, :context] for key in spaces.observations}, spaces, config)
+    dtype = compute_dtype(config)
+    start = {"deter": jnp.zeros((B, config.deter), dtype), "stoch": jnp.zeros((B, config.stoch, config.classes), dtype)}
+    seen = rssm.observe(params, start, tokens, prev_action[:, :context], is_first[:, :context], noise["posterior"], config)
+
+    def step(carry: dict[str, jax.Array], now: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[dict[str, jax.Array], Arrays]:
+        action, first, uniform = now
+        deter, stoch, action = (jnp.where(first.reshape(B, *[1] * (x.ndim - 1)), 0, x) for x in (carry["deter"], carry["stoch"], action))
+        deter = rssm.core(params, deter, stoch, action, config)
+        sample = categorical_sample(unimix_log_probs(rssm.prior(params, deter, config), config.latent_unimix), uniform)
+        carry = {"deter": deter, "stoch": sample.astype(dtype)}
+        return carry, carry
+
+    inputs = (prev_action[:, context:].swapaxes(0, 1), is_first[:, context:].swapaxes(0, 1), noise["prior"].swapaxes(0, 1))
+    _, unseen = lax.scan(step, {name: seen[name][:, -1] for name in start}, inputs)
+    states = {name: jnp.concatenate([seen[name], unseen[name].swapaxes(0, 1)], 1) for name in start}
+
+    feature = networks.feature(states["deter"], states["stoch"])
+    predictions = networks.decoder(params, feature, spaces, config)
+    return {key: _in_units(predictions[key], space) for key, space in spaces.observations.items()} | {
+        "reward": symexp_twohot_mean(networks.reward_head(params, feature, config), exponential_bins(config.bins)),
+        "continue_": bernoulli_mean(networks.continue_head(params, feature, config)),
+    }
+
+
+def _in_units(prediction: jax.Array, space: Vector | Discrete | Image) -> jax.Array:
+    """The decoder's output as what it predicts. [WM-23]"""
+    if isinstance(space, Vector):
+        return symexp(prediction)
+    if isinstance(space, Discrete):
+        ends = [sum(space.classes[: entry + 1]) for entry in range(len(space.classes) - 1)]
+        return jnp.concatenate([jax.nn.softmax(logits) for logits in jnp.split(prediction, ends, -1)], -1)
+    return prediction

@@ -10,10 +10,11 @@ import torch
 from torch import Tensor
 
 from impl_torch.agent import gradients, initial_parameters, policy_step
-from impl_torch.optimizer import flat_optimizer, flat_step_
+from impl_torch.optimizer import clip_flat_gradients_, flat_optimizer, flat_step_
 from impl_torch.parameters import Layout, Parameters
 from impl_torch.rssm import freeze
-from impl_torch.shapes import compute_dtype, wide_dtype
+from impl_torch.shapes import compute_dtype, expect, wide_dtype
+from impl_torch.world_model import open_loop
 from spec import Config, Discrete, Spaces, parameter_table
 
 Arrays = Mapping[str, np.ndarray]
@@ -27,13 +28,16 @@ _THREADS = torch.get_num_threads()  # as the process came
 class Learner:
     """One agent.
 
-    All of its state lies in a few flat buffers that a train step changes in place. seed: of the initial parameters.
+    All of its state lies in a few flat buffers that a train step changes in place. seed: of the initial parameters. nonfinite: "stop" or
+    "skip", [LOOP-40] to [LOOP-42].
 
     Raises:
-      ValueError: a device that is unknown or not there.
+      ValueError: a device that is unknown or not there, or another word for `nonfinite`.
     """
 
     def __init__(self, spaces: Spaces, config: Config, *, seed: int, device: str | None = None, nonfinite: str = "stop") -> None:
+        expect(nonfinite in ("stop", "skip"), "nonfinite", "'stop' or 'skip'", nonfinite)
+        self._nonfinite, self._stopped = nonfinite, False
         self.spaces, self.config = spaces, config
         self._device = select_device(device)
         self.device = str(self._device)
@@ -103,34 +107,43 @@ class Learner:
         return np.asarray(taken), latents, state | {"action": action}
 
     def train_step(self, batch: Arrays, seed: int) -> tuple[dict[str, Any], dict[str, Any]]:
-        """One gradient step on a replay batch, with the noise of a seed: metrics by name, latents to write back. [AGT-29] [AGT-30]"""
-        config = self.config
-        inputs = {name: self._to_device(x) for name, x in batch.items()}
-        params = self.parameters.mapping()
-        by_name, total, aux = gradients(
-            params, self._slow_critic, (self._low, self._high), inputs, self._train_noise(inputs, seed), self.spaces, config
-        )
+        """One gradient step on a replay batch, with the noise of a seed: metrics by name, latents to write back.
+
+        [AGT-29] [AGT-30] [LOOP-40] to [LOOP-42]
+        """
+        _, metrics, factors, aux = self._differentiate(batch, seed)
         with torch.no_grad():
-            self._layout.pack(by_name.values(), out=self._gradient)
-            norms, factors = flat_step_(self._optimizer, self._flat, self._gradient, self._layout, config)
-            self._slow_flat.lerp_(self._critic_flat, 1 - config.slow_critic_decay)
-            self._low, self._high = aux["return_range"]
-            self._acting = None
-            group = self._optimizer.param_groups[0]
-            update = torch.linalg.vector_norm(self._momentum) * (group["lr"] / (1 - config.beta1**self._step))
-            metrics = {
-                "loss/total": total,
-                **{f"loss/{name}": value for name, value in aux["losses"].items()},
-                **aux["metrics"],
-                "return_low": self._low,
-                "return_high": self._high,
-                "gradient_norm": torch.linalg.vector_norm(norms),
-                "update_norm": update,
+            # Read on the host: with a GPU, its queue runs empty here once a step. An update that is chosen on the device would have to
+            # write every buffer anew.
+            finite = bool(torch.stack([metrics["loss/total"].double(), metrics["gradient_norm"]]).isfinite().all())
+            applied = finite and not self._stopped
+            self._stopped = self._nonfinite == "stop" and not applied
+            metrics |= {
+                "update_norm": self._update(aux["return_range"]) if applied else self._flat.new_zeros(()),
                 "clip_fraction": (factors < 1).double().mean(),
+                "skipped": self._flat.new_full((), float(not applied)),
             }
             values = _to_host(torch.stack([value.double() for value in metrics.values()]))
             latents = {"deter": _to_host(aux["deter"].float()), "stoch": _to_host(aux["stoch"].argmax(-1))}
         return {name: _Element(values, index) for index, name in enumerate(metrics)}, latents
+
+    def gradients(self, batch: Arrays, seed: int) -> tuple[dict[str, float], dict[str, np.ndarray]]:
+        """The metrics and the gradient of every parameter that a train step would compute now. Changes nothing. [LOOP-44]"""
+        by_name, metrics, _, _ = self._differentiate(batch, seed)
+        return {name: float(x) for name, x in metrics.items()}, {name: x.cpu().numpy().copy() for name, x in by_name.items()}
+
+    @torch.no_grad()
+    def predict(self, observation: Arrays, prev_action: np.ndarray, is_first: np.ndarray, context: int, seed: int) -> dict[str, np.ndarray]:
+        """The open-loop prediction of {key: [B, T, ...]}, prev_action [B, T, A], is_first [B, T], with the noise of a seed. [WM-20]"""
+        generator, (B, T) = self._generator(seed), np.shape(is_first)
+        noise = {
+            "posterior": self._uniform(generator, B, max(0, context), self.config.stoch),
+            "prior": self._uniform(generator, B, max(0, T - context), self.config.stoch),
+        }
+        inputs = {key: self._to_device(observation[key]) for key in self.spaces.observations if key in observation}
+        actions, starts = self._to_device(prev_action), self._to_device(is_first)
+        predictions = open_loop(self.parameters.mapping(), inputs, actions, starts, context, noise, self.spaces, self.config)
+        return {key: value.cpu().numpy() for key, value in predictions.items()}
 
     def state_dict(self) -> dict[str, np.ndarray]:
         """The training state under its canonical names, as copies. [AGT-8] [AGT-9]"""
@@ -159,6 +172,36 @@ class Learner:
             x.copy_(torch.tensor(np.asarray(state[name])))
         self._set_step(int(state["optimizer/step"]))
         self._acting = None
+        self._stopped = False
+
+    def _differentiate(self, batch: Arrays, seed: int) -> tuple[dict[str, Tensor], dict[str, Tensor], Tensor, dict[str, Any]]:
+        """(gradients, metrics, what clipping multiplied each gradient by [P], aux); the clipped gradients are in `_gradient`."""
+        config = self.config
+        inputs = {name: self._to_device(x) for name, x in batch.items()}
+        noise, return_range = self._train_noise(inputs, seed), (self._low, self._high)
+        by_name, total, aux = gradients(self.parameters.mapping(), self._slow_critic, return_range, inputs, noise, self.spaces, config)
+        with torch.no_grad():
+            self._layout.pack(by_name.values(), out=self._gradient)
+            norms, factors = clip_flat_gradients_(self._gradient, self._flat, self._layout, config.agc_clip, config.agc_epsilon)
+            metrics = {
+                "loss/total": total,
+                **{f"loss/{name}": value for name, value in aux["losses"].items()},
+                **aux["metrics"],
+                "return_low": aux["return_range"][0],
+                "return_high": aux["return_range"][1],
+                "gradient_norm": torch.linalg.vector_norm(norms),
+            }
+        return by_name, metrics, factors, aux
+
+    def _update(self, return_range: tuple[Tensor, Tensor]) -> Tensor:
+        """The whole training state takes the step of the clipped gradients. Returns the norm of what the parameters moved by."""
+        config = self.config
+        flat_step_(self._optimizer, self._flat, self._gradient, config)
+        self._slow_flat.lerp_(self._critic_flat, 1 - config.slow_critic_decay)
+        self._low, self._high = return_range
+        self._acting = None
+        rate = self._optimizer.param_groups[0]["lr"]
+        return torch.linalg.vector_norm(self._momentum) * (rate / (1 - config.beta1**self._step))
 
     def _tensors(self) -> dict[str, Tensor]:
         """Everything in the training state but whole numbers, under canonical names; writing to a tensor changes the state."""

@@ -188,7 +188,8 @@ def optimizer_step(
     layout, dtype, step = Layout({name: tuple(x.shape) for name, x in params.items()}), wide_dtype(config), int(state["step"])
     flat, gradient, second_moment, momentum = (layout.pack(tree[name].to(dtype) for name in params) for tree in (params, *trees.values()))
     optimizer = flat_optimizer(flat, second_moment, momentum, step, config)
-    flat_step_(optimizer, flat, gradient, layout, config)
+    clip_flat_gradients_(gradient, flat, layout, config.agc_clip, config.agc_epsilon)
+    flat_step_(optimizer, flat, gradient, config)
     moments = {"second_moment": layout.views(second_moment), "momentum": layout.views(momentum)}
     return layout.views(flat), {"step": step + 1, **moments}
 
@@ -200,11 +201,9 @@ def flat_optimizer(flat: Tensor, second_moment: Tensor, momentum: Tensor, step: 
     return optimizer
 
 
-def flat_step_(optimizer: LaProp, flat: Tensor, gradient: Tensor, layout: Layout, config: Config) -> tuple[Tensor, Tensor]:
-    """The whole step on flat buffers, in place (the gradient is clipped in place too). Returns what `clip_flat_gradients_` does."""
-    norms, factors = clip_flat_gradients_(gradient, flat, layout, config.agc_clip, config.agc_epsilon)
+def flat_step_(optimizer: LaProp, flat: Tensor, gradient: Tensor, config: Config) -> None:
+    """One update of a flat buffer, in place, by a gradient that `clip_flat_gradients_` has clipped."""
     optimizer.param_groups[0]["lr"] = learning_rate(optimizer.state[flat]["step"], config)
     flat.grad = gradient
     optimizer.step()
     flat.grad = None
-    return norms, factors

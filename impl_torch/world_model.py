@@ -8,19 +8,23 @@ from torch import Tensor
 
 from impl_torch.distributions import (
     bernoulli_loss,
+    bernoulli_mean,
     categorical_kl,
     categorical_log_prob,
     mse_loss,
+    sample_onehot,
     symexp_twohot_loss,
+    symexp_twohot_mean,
     symlog_mse_loss,
     unimix_log_probs,
+    unimix_probs,
 )
 from impl_torch.layers import Params
-from impl_torch.networks import Observations, check_observations, continue_head, decoder, feature, reward_head
-from impl_torch.rssm import prior
-from impl_torch.shapes import expect_keys, expect_same_shape, expect_shape, wide_dtype, widen
-from impl_torch.transforms import standard_bins
-from spec import Config, Image, Spaces, Vector
+from impl_torch.networks import Observations, check_observations, continue_head, decoder, encoder, feature, reward_head
+from impl_torch.rssm import core, observe, prepare, prior
+from impl_torch.shapes import compute_dtype, expect, expect_keys, expect_same_shape, expect_shape, wide_dtype, widen
+from impl_torch.transforms import standard_bins, symexp
+from spec import Config, Discrete, Image, Spaces, Vector
 
 
 def continue_target(is_terminal: Tensor, config: Config) -> Tensor:
@@ -85,3 +89,67 @@ def world_model_losses(
         "dynamics": dynamics,
         "representation": representation,
     }
+
+
+@torch.no_grad()
+def open_loop(
+    params: Params,
+    observation: Observations,
+    prev_action: Tensor,
+    is_first: Tensor,
+    context: int,
+    noise: Mapping[str, Tensor],
+    spaces: Spaces,
+    config: Config,
+) -> dict[str, Tensor]:
+    """{key: [B, T, ...]} in the observations' own units, probabilities for a Discrete, with "reward" and "continue_" [B, T].
+
+    [WM-20] [WM-21] [WM-22] [WM-23] [WM-24]
+    observation {key: [B, T, ...]}, read up to `context`; prev_action [B, T, A]; is_first [B, T];
+    noise: "posterior" [B, context, S], "prior" [B, T-context, S].
+
+    Raises:
+      ValueError: a context outside of 1 ... T-1, or what `encoder` and `observe` refuse.
+    """
+    expect(is_first.ndim == 2, "is_first", "shape [B, T]", list(is_first.shape))
+    B, T = is_first.shape
+    expect(1 <= context < T, "context", f"1 to {T - 1} steps of {T}", context)
+    expect_shape("prev_action", prev_action, (B, T, spaces.action_size))
+    expect_shape("noise['posterior']", noise["posterior"], (B, context, config.stoch))
+    expect_shape("noise['prior']", noise["prior"], (B, T - context, config.stoch))
+    expect_keys("observation", observation, spaces.observations)
+    for key, space in spaces.observations.items():
+        expect_shape(f"observation {key!r}", observation[key], (B, T, *space.array_shape))
+
+    params, dtype = prepare(params, config), compute_dtype(config)
+    tokens = encoder(params, {key: observation[key][:, :context] for key in spaces.observations}, spaces, config)
+    zeros = {"deter": (B, config.deter), "stoch": (B, config.stoch, config.classes)}
+    start = {name: torch.zeros(shape, dtype=dtype, device=tokens.device) for name, shape in zeros.items()}
+    states = observe(params, start, tokens, prev_action[:, :context], is_first[:, :context], noise["posterior"], config)
+    deters, stochs = list(states["deter"].unbind(1)), list(states["stoch"].unbind(1))
+    for t in range(context, T):
+        first = is_first[:, t].bool()
+        inputs = (deters[-1], stochs[-1], prev_action[:, t])
+        deter, stoch, action = (x.masked_fill(first.view(-1, *[1] * (x.ndim - 1)), 0) for x in inputs)
+        deter = core(params, deter, stoch, action, config)
+        probs = unimix_probs(prior(params, deter, config), config.latent_unimix)
+        deters.append(deter)
+        stochs.append(sample_onehot(probs, noise["prior"][:, t - context]).to(dtype))
+
+    state = feature(torch.stack(deters, 1), torch.stack(stochs, 1))
+    predictions = decoder(params, state, spaces, config)
+    bins = standard_bins(config.bins, wide_dtype(config), state.device)
+    return {
+        **{key: _in_units(predictions[key], space) for key, space in spaces.observations.items()},
+        "reward": symexp_twohot_mean(reward_head(params, state, config), bins),
+        "continue_": bernoulli_mean(continue_head(params, state, config)),
+    }
+
+
+def _in_units(prediction: Tensor, space: Vector | Discrete | Image) -> Tensor:
+    """What the decoder's output says. [WM-23]"""
+    if isinstance(space, Vector):
+        return symexp(prediction)
+    if isinstance(space, Discrete):
+        return torch.cat([logits.softmax(-1) for logits in prediction.split(space.classes, -1)], -1)
+    return prediction

@@ -9,19 +9,22 @@ from numpy.typing import NDArray
 from reference_numpy import networks, rssm
 from reference_numpy.distributions import (
     bernoulli_loss,
+    bernoulli_mean,
     categorical_kl,
     categorical_log_prob,
+    categorical_sample,
     mse_loss,
     symexp_twohot_loss,
+    symexp_twohot_mean,
     symlog_mse_loss,
     unimix_log_probs,
 )
 from reference_numpy.observations import one_hots, scaled_image
 from reference_numpy.shapes import checked, require_shape
 from reference_numpy.stop_gradient import stop_gradient
-from reference_numpy.transforms import exponential_bins
+from reference_numpy.transforms import exponential_bins, symexp
 from spec.config import Config
-from spec.spaces import Discrete, Image, Spaces
+from spec.spaces import Discrete, Image, Spaces, Vector
 
 Array = NDArray[np.float64]
 
@@ -150,6 +153,79 @@ def world_model_losses(
         "dynamics": dynamics,
         "representation": representation,
     }
+
+
+def open_loop(
+    params: Mapping[str, Any],
+    observation: Mapping[str, Any],
+    prev_action: Any,
+    is_first: Any,
+    context: int,
+    noise: Mapping[str, Any],
+    spaces: Spaces,
+    config: Config,
+) -> dict[str, Array]:
+    """What the model sees coming: a few observations, then actions alone. Implements [WM-20] to [WM-24].
+
+    Paper: World model learning (figure of multi-step predictions); D-138.
+
+    Args:
+      params: `encoder/...`, `rssm/...`, `decoder/...`, `reward/...` and `continue/...`.
+      observation: key -> [B, T, ...], raw; what comes after the context is not read.
+      prev_action: [B, T, A]; entry t is the flat action that led to observation t.
+      is_first: [B, T] bool.
+      context: steps with observations, 1 to T - 1.
+      noise: {"posterior" [B, context, S], "prior" [B, T - context, S]}, numbers in [0, 1).
+
+    Returns:
+      At every step, by observation key: Vector [B, T, size] in its own units, Discrete [B, T, sum of classes] probabilities, Image
+      [B, T, height, width, channels] in [0, 1]; and "reward" [B, T], "continue_" [B, T] probabilities.
+
+    Raises:
+      ValueError: a key is missing, a shape, dtype or Discrete value does not fit, or the context is not within the sequence.
+    """
+    is_first = np.asarray(is_first, dtype=bool)
+    require_shape("is_first", is_first.shape, "B", "T")
+    rows, steps = is_first.shape
+    if not 1 <= context < steps:
+        raise ValueError(f"context: expected 1 to {steps - 1} steps of {steps}, got {context}")
+    prev_action = checked("prev_action", prev_action, rows, steps, spaces.action_size)
+    prior_noise = checked("noise['prior']", noise["prior"], rows, steps - context, config.stoch)
+    for key, space in spaces.observations.items():
+        if key not in observation:
+            raise ValueError(f"observation: the key {key!r} is missing; got {sorted(observation)}")
+        require_shape(f"observation {key!r}", np.shape(observation[key]), rows, steps, *space.array_shape)
+
+    seen = {key: np.asarray(observation[key])[:, :context] for key in spaces.observations}
+    tokens = networks.encoder(params, seen, spaces, config)
+    zeros = {"deter": np.zeros((rows, config.deter)), "stoch": np.zeros((rows, config.stoch, config.classes))}
+    states = rssm.observe(params, zeros, tokens, prev_action[:, :context], is_first[:, :context], noise["posterior"], config)
+    deters, stochs = list(np.moveaxis(states["deter"], 1, 0)), list(np.moveaxis(states["stoch"], 1, 0))
+    for t in range(context, steps):
+        starts = is_first[:, t, None]
+        stoch = np.where(starts[..., None], 0.0, stochs[-1])
+        deter = rssm.core(params, np.where(starts, 0.0, deters[-1]), stoch, np.where(starts, 0.0, prev_action[:, t]), config)
+        log_probs = unimix_log_probs(rssm.prior(params, deter, config), config.latent_unimix)
+        deters.append(deter)
+        stochs.append(categorical_sample(log_probs, prior_noise[:, t - context]))
+
+    feature = networks.feature(np.stack(deters, axis=1), np.stack(stochs, axis=1))
+    predictions = networks.decoder(params, feature, spaces, config)
+    return {
+        **{key: _in_units(predictions[key], space) for key, space in spaces.observations.items()},
+        "reward": symexp_twohot_mean(networks.reward_head(params, feature, config), exponential_bins(config.bins)),
+        "continue_": bernoulli_mean(networks.continue_head(params, feature, config)),
+    }
+
+
+def _in_units(prediction: Array, space: Vector | Discrete | Image) -> Array:
+    """The decoder's output as what it predicts: [WM-23]."""
+    if isinstance(space, Vector):
+        return symexp(prediction)
+    if isinstance(space, Discrete):
+        entries = np.split(prediction, np.cumsum(space.classes)[:-1], axis=-1)
+        return np.concatenate([np.exp(unimix_log_probs(logits, 0.0)) for logits in entries], axis=-1)
+    return prediction
 
 
 def _cross_entropy(logits: Array, target: Array, space: Discrete) -> Array:

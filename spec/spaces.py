@@ -72,7 +72,7 @@ class Image:
 
 
 _KEY = re.compile(r"[A-Za-z0-9_-]+")
-_RESERVED = frozenset({"reward", "is_first", "is_last", "is_terminal", "prev_action", "action", "deter", "stoch", "ids"})
+_RESERVED = frozenset({"reward", "continue_", "is_first", "is_last", "is_terminal", "prev_action", "action", "deter", "stoch", "ids"})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,8 +80,8 @@ class Spaces:
     """The observations and actions of a task.
 
     Raises:
-      ValueError: no observation or no action, a key that cannot name a parameter or that a record or a batch uses itself, or images
-        of different sizes.
+      ValueError: no observation or no action, a key that cannot name a parameter or that a record, a batch or a prediction uses itself,
+        or images of different sizes.
     """
 
     observations: Mapping[str, Vector | Discrete | Image]
@@ -96,7 +96,7 @@ class Spaces:
             if not _KEY.fullmatch(key):
                 raise ValueError(f"the key {key!r} may hold only letters, digits, '_' and '-'")
         for key in sorted(_RESERVED.intersection(self.observations)):
-            raise ValueError(f"the observation key {key!r} is reserved for records and batches; rename it")
+            raise ValueError(f"the observation key {key!r} is reserved for records, batches and predictions; rename it")
         if len({(image.height, image.width) for image in self.images.values()}) > 1:
             raise ValueError(f"all images must share height and width, got {self.images}")
 

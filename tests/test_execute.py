@@ -1,6 +1,7 @@
 """How checks are run on what somebody hands in."""
 
 import types
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -57,8 +58,23 @@ def test_two_deviations_are_a_deviation() -> None:
 
 
 def test_a_device_that_is_not_there(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["run", "--backend", "torch", "--device", "abacus"]) == 2
+    assert main(["check", "torch", "--device", "abacus"]) == 2
     error = capsys.readouterr().err
     assert error.startswith("conformance: error: ")
     assert "abacus" in error
     assert error.count("\n") == 1
+
+
+def test_a_candidate_is_a_column_a_module_or_a_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "helper.py").write_text("import numpy as np\n\n\ndef right(x):\n    return np.sign(x) * np.log1p(np.abs(x))\n")
+    (tmp_path / "mine.py").write_text("from helper import right\n\n\ndef symlog(x):\n    return right(x)\n")
+    only = ["--only", "symlog_matches"]
+    assert main(["check", str(tmp_path / "mine.py"), *only]) == 0
+    monkeypatch.chdir(tmp_path)
+    assert main(["check", "mine", *only]) == 0
+    assert main(["check", "numpy", *only]) == 0
+    for wrong in ("absent.py", "absent_module", "absent.module"):
+        assert main(["check", wrong, *only]) == 2
+        assert wrong.partition(".")[0] in capsys.readouterr().err

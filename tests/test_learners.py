@@ -4,17 +4,12 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-import torch
 from jax.experimental.compilation_cache import compilation_cache
 from safetensors.numpy import load, load_file, save
 
 from conformance.problems import random_batch, random_observations, random_state, small_config, spaces
-from impl_jax import layers as jax_layers
-from impl_jax.learner import select_device as jax_device
-from impl_torch import layers as torch_layers
 from reference_numpy import agent as reference
 from spec import Config, Discrete, Spaces, parameter_table
 from train import checkpoint
@@ -402,88 +397,3 @@ def test_what_a_learner_returns(learner: Learner) -> None:
     assert np.asarray(latents["stoch"]).dtype.kind in "iu"
     assert np.asarray(latents["stoch"]).max() < CONFIG.classes
     assert_same_state(inputs, before)
-
-
-@pytest.mark.parametrize("device", ["tpu9", "cpuu", "cuda:", "cudagpu", "cuda:99", "gpu:99"])
-def test_unknown_devices_are_named(backend: str, device: str) -> None:
-    with pytest.raises(ValueError, match=device):
-        learner_class(backend)(TASK, CONFIG, seed=0, device=device)
-
-
-def test_jax_counts_devices(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(jax, "devices", lambda kind=None: {"cpu": ["the processor"], "cuda": ["one", "two"], "gpu": ["one", "two"]}[kind])
-    names = ("cpu", "gpu", "cuda", "cuda:0", "cuda:1", "gpu:1")
-    assert [jax_device(name) for name in names] == ["the processor", "one", "one", "one", "two", "two"]
-    for name in ("cuda:2", "gpu:10"):
-        with pytest.raises(ValueError, match=f"'{name}'.*2 GPUs"):
-            jax_device(name)
-
-
-def test_a_large_learner_gets_back_the_threads_that_a_small_one_gave_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    before = torch.get_num_threads()
-    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
-    monkeypatch.setattr("impl_torch.learner._THREADS", 3)
-    try:
-        counts = []
-        for deter in (48, 768, 48):
-            make("torch", config=small_config("paper", "float32", deter=deter))
-            counts.append(torch.get_num_threads())
-    finally:
-        torch.set_num_threads(before)
-    assert counts == [1, 3, 1]
-
-
-# What bfloat16 must not round
-
-
-@pytest.mark.covers("CON-23")
-@pytest.mark.parametrize("kind", ["stride 1", "stride 2", "transposed"])
-def test_the_gradient_of_a_convolutions_bias_is_summed_in_float32(kind: str) -> None:
-    generator = torch.Generator().manual_seed(0)
-    x, kernel, bias = (torch.randn(*shape, generator=generator) for shape in ((3, 2, 16, 16, 4), (5, 5, 4, 6), (6,)))
-    results = []
-    for dtype in (torch.bfloat16, torch.float32):
-        leaf = bias.clone().requires_grad_()
-        if kind == "transposed":
-            y = torch_layers.transposed_convolution(x.to(dtype), kernel, leaf)
-        else:
-            y = torch_layers.convolution(x.to(dtype), kernel, leaf, int(kind[-1]))
-        weights = torch.rand(y.shape, generator=torch.Generator().manual_seed(1)).to(torch.bfloat16)
-        y.backward(weights.to(dtype))
-        results.append((y.detach().float().numpy(), leaf.grad.numpy(), weights.double().sum(tuple(range(4))).numpy()))
-    (narrow, by_bias, expected), (wide, wide_by_bias, _) = results
-    np.testing.assert_allclose(by_bias, expected, rtol=1e-6)
-    np.testing.assert_allclose(wide_by_bias, expected, rtol=1e-6)
-    np.testing.assert_allclose(narrow, wide, rtol=0.01, atol=0.2)
-
-
-@pytest.mark.covers("LAY-1", "LAY-4", "CON-23")
-@pytest.mark.parametrize("function", ["rms_norm", "silu of it"])
-def test_a_norm_reads_its_scale_in_bfloat16_and_has_its_gradient_in_float32(backend: str, function: str) -> None:
-    """Rounding the scale beforehand changes neither values nor gradients; the gradient itself is not rounded."""
-    rng = np.random.default_rng(0)
-    x, scale, by_y = (rng.normal(1, 0.3, shape).astype(np.float32) for shape in ((50, 32), (32,), (50, 32)))
-    rounded = torch.tensor(scale).bfloat16().float().numpy()
-    assert not np.array_equal(scale, rounded)
-    results = [_norm_and_gradients(backend, function, x, values, by_y) for values in (scale, rounded)]
-    for part, expected in zip(*results, strict=True):
-        np.testing.assert_array_equal(part, expected)
-    by_scale = results[0][2]
-    assert not np.array_equal(by_scale, torch.tensor(by_scale).bfloat16().float().numpy())
-
-
-def _norm_and_gradients(backend: str, function: str, x: np.ndarray, scale: np.ndarray, by_y: np.ndarray) -> list[np.ndarray]:
-    """Value of the norm of x in bfloat16, and the gradients by x and scale."""
-    if backend == "jax":
-        norm = jax_layers.rms_norm if function == "rms_norm" else jax_layers.activate
-
-        def pulled(x: jax.Array, scale: jax.Array, by_y: jax.Array) -> tuple[jax.Array, ...]:
-            y, pullback = jax.vjp(lambda x, scale: norm(x, scale, 1e-4), x, scale)
-            return y, *pullback(by_y)
-
-        narrow = jnp.bfloat16
-        return [np.asarray(part, np.float32) for part in jax.jit(pulled)(x.astype(narrow), scale, by_y.astype(narrow))]
-    narrow_x, wide_scale = torch.tensor(x).bfloat16().requires_grad_(), torch.tensor(scale).requires_grad_()
-    y = (torch_layers.rms_norm if function == "rms_norm" else torch_layers.norm_silu)(narrow_x, wide_scale, 1e-4)
-    y.backward(torch.tensor(by_y).bfloat16())
-    return [part.detach().float().numpy() for part in (y, narrow_x.grad, wide_scale.grad)]

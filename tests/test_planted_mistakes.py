@@ -13,6 +13,7 @@ from conformance import cli, mutants
 from conformance.adapter import load_adapter
 from conformance.adapters.numpy_adapter import NumpyAdapter
 from conformance.check import Check, Run, round_to
+from conformance.commands import mutants as command
 from conformance.execute import run_check, selected_checks
 from conformance.mutants import MUTANTS, MutantAdapter
 from reference_numpy import layers
@@ -65,8 +66,8 @@ def test_broken_checks_catch_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: 
         "harmless": mutants.Mutant("harmless", "none", {"layers.silu": layers.silu}),
         "scalar": mutants.Mutant("scalar", "silu forgets the axes", {"layers.silu": lambda x: np.float64(0.5)}),
     }
-    monkeypatch.setattr(cli, "selected_checks", lambda dtype: checks)
-    monkeypatch.setattr(cli, "MUTANTS", planted)
+    monkeypatch.setattr(command, "selected_checks", lambda dtype: checks)
+    monkeypatch.setattr(command, "MUTANTS", planted)
     assert cli.main(["mutants", "--json", str(tmp_path / "mutants.json")]) == 1
     report = json.loads((tmp_path / "mutants.json").read_text(encoding="utf-8"))
     assert {name: entry["caught_by"] for name, entry in report["mutants"].items()} == {

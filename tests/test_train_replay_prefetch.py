@@ -60,6 +60,9 @@ class Slow:
         self.ready.wait(10)
         return self.value
 
+    def __float__(self) -> float:
+        return float(np.asarray(self))
+
 
 def history(buffer: Any, begin: int, end: int) -> list[dict[str, np.ndarray]]:
     batches = []
@@ -101,6 +104,26 @@ def test_latents_are_written_back_before_the_draw_after_next() -> None:
     buffer.take()
     buffer.close()
     assert events == ["draw", "draw", "write", "draw", "write", "draw"]
+
+
+@pytest.mark.covers("LOOP-43")
+def test_the_latents_of_a_skipped_train_step_are_not_written_back() -> None:
+    """The thread waits for the word, not the caller; the next step's latents are written again."""
+    buffer = Prefetcher(Replay(50, LENGTH), uniform)
+    for n in range(10):
+        buffer.add_batch(steps_of(n))
+    before, ready = buffer.replay.state_dict(), threading.Event()
+    spoiled = {key: np.full_like(value, np.nan if key == "deter" else 0) for key, value in fresh(0).items()}
+    buffer.write_back(buffer.take()["ids"], spoiled, skipped=Slow(np.array(1.0), ready))
+    batch = buffer.take()
+    ready.set()
+    buffer.write_back(batch["ids"], fresh(1), skipped=np.array(0.0))
+    buffer.close()
+    expected = Replay(50, LENGTH)
+    expected.load_state_dict(before)
+    expected.write_back(batch["ids"], fresh(1))
+    assert_same(buffer.replay.state_dict(), expected.state_dict())
+    assert not np.array_equal(before["records/deter"], buffer.replay.state_dict()["records/deter"])
 
 
 @pytest.mark.covers("REP-29", "REP-33")

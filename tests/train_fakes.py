@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces as gym
 
-from spec import Config, Spaces
+from spec import Config, Image, Spaces
 from train.envs import random_actions
 
 EPISODE = 4  # steps of an episode of `Counting`, the reset not counted
@@ -183,6 +183,23 @@ class FakeLearner:
         shape = (self._config.batch_size, self._config.batch_length)
         deter = np.full((*shape, self._config.deter), 1000 + self._train_steps, np.float32)
         return {"loss/total": np.float32(self.loss)}, {"deter": deter, "stoch": np.ones((*shape, self._config.stoch), np.int32)}
+
+    def predict(
+        self, observation: Mapping[str, np.ndarray], prev_action: np.ndarray, is_first: np.ndarray, context: int, seed: int
+    ) -> dict[str, np.ndarray]:
+        """The reward that is predicted is the number of the step; everything else is 0.5."""
+        self.seeds.append(("predict", seed))
+        self.diary.append(("predict", {**observation, "prev_action": prev_action, "is_first": is_first}))
+        sizes = {
+            key: space.array_shape if isinstance(space, Image) else (space.encoded_size,)
+            for key, space in self._spaces.observations.items()
+        }
+        halves = {key: np.full((*is_first.shape, *size), 0.5, np.float32) for key, size in sizes.items()}
+        return {
+            **halves,
+            "continue_": np.full(is_first.shape, 0.5),
+            "reward": np.broadcast_to(np.arange(is_first.shape[1]), is_first.shape),
+        }
 
     def state_dict(self) -> dict[str, np.ndarray]:
         return {

@@ -17,7 +17,11 @@ Arrays = Mapping[str, np.ndarray]
 
 
 class Learner(Protocol):
-    """What `impl_jax.learner.Learner` and `impl_torch.learner.Learner` offer. seed: of the initial parameters."""
+    """What `impl_jax.learner.Learner` and `impl_torch.learner.Learner` offer.
+
+    seed: of the initial parameters. nonfinite: "stop" or "skip", what follows a train step whose total loss or gradient norm is not finite.
+    Either way it changes nothing ([LOOP-40]); after "stop" no later train step does, until `load_state_dict` ([LOOP-41]).
+    """
 
     device: str
 
@@ -45,7 +49,27 @@ class Learner(Protocol):
 
     def train_step(self, batch: Arrays, seed: int) -> tuple[Mapping[str, Any], Arrays]:
         """One gradient step on a replay batch. Returns scalar metrics by name and the latents to write back
-        {"deter": [B, T, D], "stoch": [B, T, S] class indices}; both may still be computing when this returns."""
+        {"deter": [B, T, D], "stoch": [B, T, S] class indices}; both may still be computing when this returns.
+
+        The metric `skipped` is 1 where the update was not made, else 0. The latents of such a step are not to be written back ([LOOP-43]).
+        """
+
+    def gradients(self, batch: Arrays, seed: int) -> tuple[Mapping[str, float], dict[str, np.ndarray]]:
+        """What `train_step` would compute now up to the gradients, with the same noise: metrics and gradients by canonical names.
+
+        Changes nothing, and does so after a stop as well.
+        """
+
+    def predict(self, observation: Arrays, prev_action: np.ndarray, is_first: np.ndarray, context: int, seed: int) -> dict[str, np.ndarray]:
+        """The open-loop prediction of recorded sequences: [WM] open-loop prediction. Nothing in the learner changes.
+
+        observation: key -> [B, T, ...], of which `context` steps are seen; prev_action: [B, T, A], the action before each observation;
+        is_first: bool [B, T]. Returns by observation key [B, T, ...]: numbers in their own units, probabilities of a Discrete's classes
+        [B, T, sum of classes], images in [0, 1]; and "reward" and "continue_" [B, T].
+
+        Raises:
+          ValueError: a missing key, a wrong shape, or a context that is not within the sequence.
+        """
 
     def state_dict(self) -> dict[str, np.ndarray]:
         """The training state under its canonical names: [AGT-9]."""

@@ -45,6 +45,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
         return 0 if loop.run(options) else 130
     except UserError as error:
+        if error.details:
+            print(error.details.rstrip(), file=sys.stderr)
         print(f"train: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:

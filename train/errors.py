@@ -2,4 +2,11 @@
 
 
 class UserError(Exception):
-    """Something that the user can mend. The message names the thing and the remedy; `train` prints it in one line and exits with code 2."""
+    """Something that the user can mend. The message names the thing and the remedy; `train` prints it in one line and exits with code 2.
+
+    details: what helps to understand it and needs its own lines, such as the traceback of an environment; printed before the message.
+    """
+
+    def __init__(self, message: str, details: str = "") -> None:
+        super().__init__(message)
+        self.details = details

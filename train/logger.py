@@ -1,99 +1,265 @@
-"""What a run writes and shows: metrics.jsonl, TensorBoard events, and progress on the terminal."""
+"""What a run writes and shows: metrics.jsonl, TensorBoard events, Weights & Biases, and progress on the terminal."""
 
+import io
 import json
+import math
 import os
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
+import numpy as np
+from PIL import Image
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
-from tensorboard.summary import Writer
+from rich.progress import BarColumn, Progress, SpinnerColumn, TaskProgressColumn, TextColumn
+from tensorboard.compat.proto.event_pb2 import Event, SessionLog
+from tensorboard.compat.proto.summary_pb2 import Summary
+from tensorboard.summary.writer.event_file_writer import EventFileWriter
+
+from train.about import About
+from train.errors import UserError
 
 PLAIN_EVERY = 10.0  # seconds between lines where there is no terminal
 
+Picture = Path | np.ndarray
+
 
 class Logger:
-    """LOGDIR/metrics.jsonl, one object per line, and the same numbers for TensorBoard.
+    """LOGDIR/metrics.jsonl, one object per line, and the same numbers for TensorBoard and, if wanted, Weights & Biases.
 
-    Every line has `step` (environment steps, with action repeat) and `seconds` (of training). Beside them:
-    `episode/return`, `episode/length` (one line per training episode), `evaluation/...`, `train/...` (means since the last such line),
-    `speed/...` (per second), `random/return`.
+    Every line has `step` (environment steps, with action repeat) and `seconds` (of training). The other names: docs/metrics.md. A number
+    that is not finite stands there as NaN, Infinity or -Infinity, which Python reads and strict JSON does not know.
 
-    What was written after `position` is dropped: a run that ended without a checkpoint left it, and the resumed run writes it again. Events
-    for TensorBoard stay as they are.
+    position: the size of metrics.jsonl, in bytes, at the checkpoint that is continued: what came later is cut off, and the resumed run
+    writes it again. TensorBoard is told to hide it, Weights & Biases keeps what it has. None begins a new file.
+    wandb: a project of Weights & Biases; needs `about`, of train/about.py, whose `id` lets a resumed run continue where it was.
+    warnings: what was wrong with the file.
+
+    Raises:
+      UserError: the disk refuses it, or Weights & Biases is not installed or does not let us in.
     """
 
-    def __init__(self, logdir: Path, position: int | None = None) -> None:
-        path = logdir / "metrics.jsonl"
-        path.touch()
-        os.truncate(path, min(position or 0, path.stat().st_size))
-        self._file = path.open("a", encoding="utf-8")
-        self._tensorboard = Writer(str(logdir))
+    def __init__(self, logdir: Path, position: int | None = None, *, wandb: str | None = None, about: About | None = None) -> None:
+        self._path = logdir / "metrics.jsonl"
+        try:
+            self.warnings = _cut(self._path, position or 0)
+            self._file = self._path.open("ab")
+        except OSError as error:
+            raise UserError(f"cannot write {self._path}: {error.strerror}") from error
+        self._tensorboard = _TensorBoard(logdir, _last_step(self._path))
+        self._wandb = _Wandb(logdir, wandb, about or {}) if wandb else None
 
     def write(self, step: int, seconds: float, metrics: Mapping[str, float]) -> None:
-        line = {"step": step, "seconds": round(seconds, 3), **{name: float(value) for name, value in metrics.items()}}
-        self._file.write(json.dumps(line) + "\n")
-        self._file.flush()
-        for name, value in metrics.items():
-            self._tensorboard.add_scalar(name, value, step)
+        values = {name: float(value) for name, value in metrics.items()}
+        line = json.dumps({"step": step, "seconds": round(seconds, 3), **values}) + "\n"
+        try:
+            self._file.write(line.encode())
+            self._file.flush()
+        except OSError as error:
+            raise UserError(f"cannot write {self._path}: {error.strerror}") from error
+        self._tensorboard.scalars(values, step)
+        if self._wandb:
+            self._wandb.log(values, step)
+
+    def picture(self, name: str, picture: Picture, step: int) -> None:
+        """An image for TensorBoard and Weights & Biases: a PNG or GIF file, or uint8 [H, W], [H, W, 1] or [H, W, 3]."""
+        self._tensorboard.image(name, picture, step)
+        if self._wandb:
+            self._wandb.log_picture(name, picture, step)
 
     def position(self) -> int:
-        """How long metrics.jsonl is, in bytes, all of it on the disk."""
-        self._file.flush()
-        os.fsync(self._file.fileno())
+        """The size of metrics.jsonl in bytes, all of which are on the disk: for the checkpoint."""
+        try:
+            self._file.flush()
+            os.fsync(self._file.fileno())
+        except OSError as error:
+            raise UserError(f"cannot write {self._path}: {error.strerror}") from error
         return self._file.tell()
 
     def close(self) -> None:
         self._file.close()
         self._tensorboard.close()
+        if self._wandb:
+            self._wandb.close()
+
+
+def _cut(path: Path, position: int) -> list[str]:
+    """Cuts metrics.jsonl back to so many bytes, and to whole lines if it is not what it was. Returns what is to be said about it."""
+    path.touch()
+    with path.open("rb+") as file:
+        size = file.seek(0, os.SEEK_END)
+        file.truncate(min(size, position))
+    rest = _tail(path).rpartition(b"\n")[2]
+    kept = min(size, position) - len(rest)
+    if kept == position:
+        return []
+    os.truncate(path, kept)
+    return [f"{path} has {size:,} bytes, and {position:,} belong to the checkpoint; {kept:,} bytes of whole lines were kept"]
+
+
+def _last_step(path: Path) -> int | None:
+    """Of the last line, if there is one."""
+    for text in _tail(path).splitlines()[-1:]:
+        line = _numbers(text)
+        return int(line["step"]) if line else None
+    return None
+
+
+def _tail(path: Path) -> bytes:
+    """The end of a file, longer than any line of ours."""
+    with path.open("rb") as file:
+        file.seek(max(0, file.seek(0, os.SEEK_END) - 2**20))
+        return file.read()
+
+
+class _TensorBoard:
+    """An event file. last: hides the events of later steps in earlier files."""
+
+    def __init__(self, logdir: Path, last: int | None) -> None:
+        self._writer = EventFileWriter(str(logdir))
+        if last is not None:
+            self._writer.add_event(Event(wall_time=time.time(), step=last + 1, session_log=SessionLog(status=SessionLog.START)))
+
+    def scalars(self, metrics: Mapping[str, float], step: int) -> None:
+        self._add([Summary.Value(tag=name, simple_value=value) for name, value in metrics.items()], step)
+
+    def image(self, name: str, picture: Picture, step: int) -> None:
+        encoded = picture.read_bytes() if isinstance(picture, Path) else _png(picture)
+        with Image.open(io.BytesIO(encoded)) as image:
+            width, height = image.size
+        image_proto = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=encoded)
+        self._add([Summary.Value(tag=name, image=image_proto)], step)
+
+    def _add(self, values: list[Any], step: int) -> None:
+        self._writer.add_event(Event(wall_time=time.time(), step=step, summary=Summary(value=values)))
+
+    def close(self) -> None:
+        self._writer.close()
+
+
+class _Wandb:
+    """A run of Weights & Biases. Its steps only grow: of what a resumed run does again, it keeps what it has."""
+
+    def __init__(self, logdir: Path, project: str, about: About) -> None:
+        try:
+            import wandb
+        except ModuleNotFoundError as error:
+            raise UserError(f"--wandb needs the package {error.name}: pip install 'dreamer-spec[wandb]'") from error
+        self._wandb = wandb
+        config = {name: about[name] for name in ("task", "backend", "device", "profile", "size", "parameters", "command", "machine")}
+        config |= {"seed": about["options"]["seed"], **about["hyperparameters"]}
+        try:
+            self._run = wandb.init(
+                project=project,
+                id=about["id"],
+                name=logdir.name,
+                dir=str(logdir),
+                config=config,
+                allow_val_change=True,
+                resume="allow",
+                settings={"console": "off"},
+            )
+        except wandb.errors.Error as error:
+            raise UserError(
+                f"Weights & Biases refuses the run: {error}; run `wandb login`, set WANDB_MODE=offline, or leave out --wandb"
+            ) from error
+        self._begin = self._run.step
+
+    def log(self, values: Mapping[str, Any], step: int) -> None:
+        if step >= self._begin:
+            self._run.log(dict(values), step=step)
+
+    def log_picture(self, name: str, picture: Picture, step: int) -> None:
+        is_gif = isinstance(picture, Path) and picture.suffix == ".gif"
+        data = str(picture) if isinstance(picture, Path) else picture
+        self.log({name: self._wandb.Video(data, format="gif") if is_gif else self._wandb.Image(data)}, step)
+
+    def close(self) -> None:
+        self._run.finish()
+
+
+def _png(image: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(image[..., 0] if image.shape[2:] == (1,) else image).save(buffer, "png")
+    return buffer.getvalue()
+
+
+def iterate_metrics(path: Path) -> Iterator[dict[str, float] | None]:
+    """The lines of a metrics.jsonl one by one: the numbers of each by name, or None for a line that is damaged."""
+    if path.exists():
+        with path.open("rb") as file:
+            yield from map(_numbers, file)
+
+
+def _numbers(text: bytes) -> dict[str, float] | None:
+    """The numbers of a line by name; None if it is damaged."""
+    try:
+        line = {name: value for name, value in json.loads(text).items() if type(value) in (int, float)}
+        return line if math.isfinite(line["step"]) else None
+    except (ValueError, KeyError, AttributeError, RecursionError, OverflowError):
+        return None
 
 
 def read_metrics(path: Path) -> list[dict[str, float]]:
-    """The lines of a metrics.jsonl; a last line that was cut off in writing is left out."""
-    lines: list[dict[str, float]] = []
-    if path.exists():
-        for text in path.read_text(encoding="utf-8").splitlines():
-            try:
-                lines.append(json.loads(text))
-            except ValueError:
-                break
-    return lines
+    """The lines of a metrics.jsonl; damaged ones are left out, as is a last one that was cut off in writing."""
+    return [line for line in iterate_metrics(path) if line is not None]
 
 
 class Display:
-    """A progress bar on a terminal, while the display is entered; elsewhere a line now and then."""
+    """What goes on, as a live line on a terminal, while the display is entered; elsewhere a line now and then.
+
+    total: environment steps of the run.
+    """
 
     def __init__(self, total: int) -> None:
         self._total = total
         self._console = Console()
         self._progress: Progress | None = None
+        self._phase = ""
         self._printed = time.monotonic()
 
     def __enter__(self) -> "Display":
         if self._console.is_terminal:
-            columns = (BarColumn(bar_width=12), TaskProgressColumn(), TextColumn("{task.fields[text]}"))
+            columns = (SpinnerColumn(), BarColumn(bar_width=12), TaskProgressColumn(), TextColumn("{task.fields[text]}", markup=False))
             self._progress = Progress(*columns, console=self._console, transient=True)
             self._progress.start()
-            self._task = self._progress.add_task("", total=self._total, text="")
+            self._task = self._progress.add_task("", total=self._total, text="", visible=False)
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         if self._progress:
             self._progress.stop()
+            self._progress = None
 
     def say(self, text: str) -> None:
         self._console.print(text, highlight=False, markup=False, soft_wrap=True)
 
     def update(self, step: int, facts: Iterable[str]) -> None:
-        """To be called as often as one likes. facts: what to show, the most important first: a narrow terminal cuts the others off."""
-        text = " · ".join([f"step {step:,}", *facts])
+        """Training goes on; to be called as often as one likes.
+
+        facts: what to show, the most important first: a narrow terminal cuts the others off.
+        """
+        self._show("training", step, self._total, " · ".join([f"step {step:,}", *facts]))
+
+    def phase(self, name: str, done: int = 0, total: int | None = None, unit: str = "") -> None:
+        """Something beside training goes on; to be called as often as one likes, and before anything that takes long.
+
+        total: how much there is to do, in the unit; None if nobody knows, as with a compilation. Where there is no terminal, such a phase
+        is said when it begins, because nobody may call again before it is over.
+        """
+        self._show(name, done, total, name if total is None else f"{name} {done:,}/{total:,} {unit}".rstrip())
+
+    def _show(self, phase: str, done: int, total: int | None, text: str) -> None:
+        begins, self._phase = phase != self._phase, phase
         if self._progress:
-            self._progress.update(self._task, completed=min(step, self._total), text=text)
-        elif time.monotonic() - self._printed >= PLAIN_EVERY:
+            if begins:
+                self._progress.reset(self._task, total=total)
+            self._progress.update(self._task, total=total, completed=min(done, total or done), text=text, visible=True)
+        elif (begins and total is None) or time.monotonic() - self._printed >= PLAIN_EVERY:
             self._printed = time.monotonic()
-            self.say(f"{100 * step // self._total:3d}%  {text}")
+            self.say(text if total is None else f"{100 * done // total if total else 100:3d}%  {text}")
 
 
 def duration(seconds: float) -> str:

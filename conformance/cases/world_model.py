@@ -1,21 +1,31 @@
 """Checks of spec/06-world-model.md."""
 
 import dataclasses
+import functools
 import math
 from typing import Any
 
 import hypothesis.strategies as st
 import numpy as np
 
-from conformance.cases.agent import WHOLE, bound_of, problem_of, unit_directions
+from conformance.cases.agent import SAMPLING_MARGIN, WHOLE, bound_of, problem_of, unit_directions
 from conformance.check import Run, check, round_to
-from conformance.problems import Problem, make_problem, random_observations, small_config
+from conformance.problems import (
+    Problem,
+    make_problem,
+    random_actions,
+    random_observations,
+    random_parameters,
+    small_config,
+    spaces,
+    uniforms,
+)
 from conformance.strategies import adversarial_numbers, arrays, normals, seeds
 from reference_numpy import agent
 from reference_numpy import world_model as reference
 from reference_numpy.distributions import unimix_log_probs
 from reference_numpy.transforms import exponential_bins, twohot
-from spec import Discrete, Image, Spaces, Vector
+from spec import Config, Discrete, Image, Spaces, Vector, parameter_table
 
 ACTIONS: dict[str, Vector | Discrete] = {"turn": Vector(2)}
 TASK = Spaces({"position": Vector(3), "mode": Discrete((2, 3)), "image": Image(4, 6, 3)}, ACTIONS)
@@ -280,3 +290,151 @@ def constants_of_the_kl(run: Run) -> None:
                 run.holds(f"{name} moves with {label}", derivative != 0)
             elif not label.startswith("all"):
                 run.exact(f"derivative of {name} by {label}", derivative, 0.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Sequences:
+    """The arguments of `open_loop`."""
+
+    params: dict[str, np.ndarray]
+    observation: dict[str, np.ndarray]
+    prev_action: np.ndarray
+    is_first: np.ndarray
+    context: int
+    noise: dict[str, np.ndarray]
+    spaces: Spaces
+    config: Config
+
+    @property
+    def arguments(self) -> tuple[Any, ...]:
+        return tuple(getattr(self, field.name) for field in dataclasses.fields(self))
+
+    def nudged(self, distance: float) -> "Sequences":
+        return dataclasses.replace(self, noise={name: value + distance for name, value in self.noise.items()})
+
+
+ROWS, STEPS, CONTEXT = 3, 7, 3
+STARTS = np.zeros((ROWS, STEPS), bool)  # row 1 goes on from zeros and is reset twice, row 2 where the prediction begins
+STARTS[[0, 1, 1, 2, 2], [0, 1, CONTEXT + 2, 0, CONTEXT]] = True
+
+
+@functools.lru_cache(maxsize=16)
+def sequences(seed: int, profile: str, dtype: str, observation: str, context: int) -> Sequences:
+    """Sequences with resets in context and prediction, in which honest rounding moves no sample into another class."""
+    config, task = small_config(profile, dtype), spaces(observation, "mixed")
+    rng = np.random.default_rng(seed)
+    for _ in range(1000):
+        noise = {"posterior": uniforms(rng, ROWS, context, config.stoch), "prior": uniforms(rng, ROWS, STEPS - context, config.stoch)}
+        params = random_parameters(rng, config, task, dtype)
+        recorded = random_observations(rng, task, (ROWS, STEPS))
+        drawn = Sequences(params, recorded, random_actions(rng, task, (ROWS, STEPS)), STARTS, context, noise, task, config)
+        below, above = (reference.open_loop(*drawn.nudged(distance).arguments) for distance in (-SAMPLING_MARGIN, SAMPLING_MARGIN))
+        if all(np.array_equal(below[key], above[key]) for key in below):
+            return drawn
+    raise RuntimeError("no sequences keep every sample away from the next class")
+
+
+@check("WM-20", "WM-21", "WM-23", "RSSM-18", "NET-1", uses=["open_loop"], level=1, dtypes=WHOLE)
+def open_loop_matches(run: Run) -> None:
+    """Every prediction of every step: images, vectors in their units, probabilities, rewards; long and short contexts, and resets."""
+    for observation, context in (("both", CONTEXT), ("vector", 1), ("vector", STEPS - 1)):
+        drawn = sequences(run.seed, run.profile, run.dtype, observation, context)
+        expected = reference.open_loop(*drawn.arguments)
+        magnitude = {key: 1 + np.abs(value).max() for key, value in expected.items()}
+        run.expect("open_loop", drawn.arguments, expected, magnitude=magnitude, bound=bound_of(run, 1e-10, 2e-4))
+
+
+@check("WM-23", uses=["open_loop"], level=1)
+def open_loop_literals(run: Run) -> None:
+    """Decoder outputs 1, -2 and 0 are 1.718282, -6.389056 and 0; logits 0, ln 3 a quarter and three; a reward between two bins."""
+    config, task = small_config(run.profile, run.dtype), spaces("both", "mixed")
+    ln3 = float(round_to(SURE, "bfloat16"))  # so that every dtype holds it
+    odds = math.exp(ln3)
+    params = {name: np.zeros(entry.shape) for name, entry in parameter_table(config, task).items()} | {
+        "decoder/vector/out/position/bias": np.array([1.0, -2, 0]),
+        "decoder/vector/out/mode/bias": np.array([0.0, ln3, 0, ln3, 0]),
+        "decoder/image/out/bias": np.array([0.0, 0, ln3, -ln3]),  # depth comes first
+        "continue/out/bias": np.array([ln3]),
+        "reward/out/bias": np.where(np.isin(np.arange(config.bins), (15, 16)), np.arange(config.bins) == 16, -1024 / ln3) * ln3,
+    }
+    noise = {"posterior": np.zeros((1, 1, config.stoch)), "prior": np.zeros((1, 1, config.stoch))}
+    observation = random_observations(run.rng(), task, (1, 2))
+    inputs = observation, random_actions(run.rng(), task, (1, 2)), np.zeros((1, 2), bool), 1, noise
+    high, low = odds / (1 + odds), 1 / (1 + odds)
+    expected = {
+        "position": [math.e - 1, 1 - math.e**2, 0],
+        "mode": [1 / (2 + odds), odds / (2 + odds), 1 / (2 + odds), high, low],
+        "depth": np.full((16, 32, 1), 0.5),
+        "image": np.broadcast_to([0.5, high, low], (16, 32, 3)),
+        "reward": high * exponential_bins(config.bins)[16],
+        "continue_": high,
+    }
+    both = {key: np.stack([[value, value]]) for key, value in expected.items()}
+    run.expect("open_loop", (params, *inputs, task, config), both, magnitude="tensor", bound=256 * run.u)
+
+
+def same(one: dict[str, Any], other: dict[str, Any], row: int, steps: slice) -> bool:
+    """Whether two predictions of a row agree in every bit in the given steps."""
+    return all(np.array_equal(one[key][row, steps], other[key][row, steps]) for key in one)
+
+
+@check("WM-20", "WM-21", "WM-22", uses=["open_loop"], level=1)
+def open_loop_reads_only_the_context(run: Run) -> None:
+    """What is observed after the context changes nothing; the last step of it changes what follows, and nothing that came before."""
+    drawn = sequences(run.seed, run.profile, "float64", "both", CONTEXT)
+    before = run.call("open_loop", *drawn.arguments)
+    others = random_observations(np.random.default_rng(run.seed + 1), drawn.spaces, (ROWS, STEPS))
+    others["position"][:] = np.nan
+    hidden = {key: np.concatenate([value[:, :CONTEXT], others[key][:, CONTEXT:]], 1) for key, value in drawn.observation.items()}
+    after = run.call("open_loop", *dataclasses.replace(drawn, observation=hidden).arguments)
+    for key, value in before.items():
+        run.exact(f"{key} after other observations", after[key], value)
+    last, changes = slice(CONTEXT - 1, CONTEXT), []
+    for seed in range(10):  # with one noise or another, the other observation draws other latents
+        rng = np.random.default_rng(seed)
+        noise = drawn.noise | {"posterior": uniforms(rng, *drawn.noise["posterior"].shape)}
+        before = run.call("open_loop", *dataclasses.replace(drawn, noise=noise).arguments)
+        others = random_observations(rng, drawn.spaces, (ROWS, STEPS))
+        shown = {key: np.concatenate([value[:, : last.start], others[key][:, last.start :]], 1) for key, value in drawn.observation.items()}
+        after = run.call("open_loop", *dataclasses.replace(drawn, noise=noise, observation=shown).arguments)
+        run.holds("nothing changes before the observation that changed", same(before, after, 0, slice(last.start)))
+        changes.append([not same(before, after, 0, steps) for steps in (last, slice(CONTEXT, None))])
+    run.holds("the last observation of the context counts, at its step and later", np.any(changes, 0))
+
+
+@check("WM-20", "RSSM-13", "RSSM-14", "RSSM-18", uses=["open_loop"], level=1)
+def open_loop_follows_actions_and_resets(run: Run) -> None:
+    """An action moves the prediction of its own step and nothing before; after a reset nothing from before it counts, not even NaN."""
+    drawn = sequences(run.seed, run.profile, "float64", "vector", CONTEXT)
+    before = run.call("open_loop", *drawn.arguments)
+    for step in (1, CONTEXT, STEPS - 1):
+        action = drawn.prev_action.copy()
+        action[0, step] = -action[0, step] + 0.25
+        after = run.call("open_loop", *dataclasses.replace(drawn, prev_action=action).arguments)
+        run.holds(f"nothing changes before action {step}", same(before, after, 0, slice(step)))
+        run.holds(f"action {step} counts at its own step", not same(before, after, 0, slice(step, step + 1)))
+    for row, step in ((1, CONTEXT + 2), (2, CONTEXT)):
+        action = drawn.prev_action.copy()
+        action[row, : step + 1] = np.nan
+        after = run.call("open_loop", *dataclasses.replace(drawn, prev_action=action).arguments)
+        run.holds(f"nothing before the reset of row {row} counts after it", same(before, after, row, slice(step, None)))
+
+
+@check("WM-24", "WM-19", "CON-8", uses=["open_loop"], level=1)
+def open_loop_refuses(run: Run) -> None:
+    """A context that is no part of the sequence, missing keys, and rows, steps or sizes that differ, are refused."""
+    drawn = sequences(run.seed, run.profile, "float64", "vector", CONTEXT)
+    config, task = drawn.config, drawn.spaces
+    for context in (-1, 0, STEPS, STEPS + 1):
+        run.refuses("open_loop", *dataclasses.replace(drawn, context=context).arguments, naming=["context"])
+    for key, value in drawn.observation.items():
+        rest = {name: other for name, other in drawn.observation.items() if name != key}
+        for wrong in (rest, rest | {key: value[..., :-1]}, rest | {key: value[:, :-1]}, rest | {key: value[:1]}):
+            run.refuses("open_loop", *dataclasses.replace(drawn, observation=wrong).arguments, naming=[key])
+    for size in ((ROWS, STEPS, task.action_size - 1), (ROWS, STEPS - 1, task.action_size), (1, STEPS, task.action_size)):
+        run.refuses("open_loop", *dataclasses.replace(drawn, prev_action=np.zeros(size)).arguments)
+    for starts in (STARTS[:, 0], STARTS[:1], STARTS[..., None]):
+        run.refuses("open_loop", *dataclasses.replace(drawn, is_first=starts).arguments)
+    for name, steps in (("posterior", CONTEXT), ("prior", STEPS - CONTEXT)):
+        for shape in ((ROWS, steps + 1, config.stoch), (1, steps, config.stoch), (ROWS, steps, 1)):
+            run.refuses("open_loop", *dataclasses.replace(drawn, noise=drawn.noise | {name: np.zeros(shape)}).arguments)

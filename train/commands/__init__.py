@@ -3,4 +3,6 @@
 COMMANDS: dict[str, str] = {  # name -> what it does, for --help
     "eval": "plays episodes with a checkpoint, on either backend",
     "export": "writes the policy of a checkpoint as a folder that runs with NumPy alone",
+    "inspect": "what a train step met whose loss or gradient was not finite; what a checkpoint holds",
+    "report": "one HTML page about one run or many",
 }

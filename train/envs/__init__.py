@@ -2,8 +2,10 @@
 
 from train.envs.adapter import ContractEnv
 from train.envs.factory import make_env
+from train.envs.history import History
 from train.envs.spaces import Translation, random_actions, translate
-from train.envs.vector import Environments, Failure, History, Record, is_slow
+from train.envs.stream import Failure
+from train.envs.vector import Environments, Record, is_slow
 
 __all__ = [
     "ContractEnv",

@@ -1,146 +1,197 @@
-"""N environments side by side, each a stream of records as in spec/00-notation.md.
+"""N environments side by side, each a stream of records as in spec/00-notation.md, and each made anew when it fails."""
 
-Gymnasium's autoreset mode NEXT_STEP gives these streams: the step after the end of an episode ignores its action and returns the reset
-observation with reward 0. So the last observation of an episode is a record of its own, with its reward and its flags.
-"""
-
-import dataclasses
-import functools
-import multiprocessing
-import signal
-import sys
+import collections
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
-import gymnasium
 import numpy as np
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
-from spec import Spaces
+from reference_numpy.training_loop import derive_seed
 from train.envs.adapter import ContractEnv
+from train.envs.history import Episode, History
 from train.envs.spaces import random_actions
+from train.envs.stream import Failure, Step
+from train.envs.worker import InProcess, OwnProcess, Worker, receive
 from train.errors import UserError
 
 Record = dict[str, np.ndarray]
 
-
-@dataclasses.dataclass(frozen=True)
-class Failure:
-    worker: int
-    kind: str
-    message: str
-
-
-@dataclasses.dataclass(frozen=True)
-class History:
-    seed: int
-    episode: int
-    actions: np.ndarray
-
-    def to_json(self) -> dict[str, Any]:
-        return {"seed": self.seed, "episode": self.episode}
-
-    @classmethod
-    def from_json(cls, entry: dict[str, Any], actions: np.ndarray) -> "History":
-        return cls(**entry, actions=actions)
-
-
-FLAGS = ("is_first", "is_last", "is_terminal")
-
 SLOW_STEP = 5e-4  # seconds; from here on a process of its own is faster than taking turns
+WINDOW = 100_000  # records of all workers among which failures are counted
+CLOSING = 5.0  # seconds that environments have to close by themselves
 
 
 class Environments:
     """`count` environments, in this process or in one process each.
 
     make: index -> environment; must be picklable by cloudpickle.
+    timeout: seconds that a step, or a reset with the making before it, may take. Only a process of its own can be held to it: an
+    environment in this process that hangs stops everything, and nobody notices.
+    failures_allowed: within 100,000 records of all workers together.
 
     `start(action)` sends the actions off, `finish()` waits for the records: what happens in between overlaps with the environments where
     they have processes of their own. `reset(seeds)` begins everywhere anew, and seeds this episode and all after it.
+
+    An environment that crashes, raises, hangs or returns what its spaces do not allow is made anew and reset; its next record has
+    `is_first`, and the others go on undisturbed: [LOOP-32].
+
+    Raises:
+      UserError: from here, if the first environment cannot be made; from `reset` and `finish`, if an environment fails before it has given
+      a record, or if there were too many failures.
     """
 
     def __init__(
         self, make: Callable[[int], ContractEnv], count: int, processes: bool, timeout: float = 600.0, failures_allowed: int = 10
     ) -> None:
+        first = make(0)
         self.count = count
-        self.failures = 0
-        self._action: np.ndarray | None = None
-        self._pending = False  # whether worker processes owe an answer, or failed to give one
-        self._is_last = np.zeros(self.count, bool)
-        makers = [functools.partial(_make_in_worker, make, index) for index in range(self.count)]
-        self._guard = _worker_errors if processes else nullcontext
-        self._envs: AsyncVectorEnv | SyncVectorEnv
+        self.spaces = first.spaces
+        self.failures = 0  # so far
+        self._failures_allowed = failures_allowed
+        self._failed_at: collections.deque[int] = collections.deque()  # records before each failure, of those in the window
+        self._untold: list[Failure] = []
+        self._records = 0
+        self._episodes: dict[int, Episode] = {}
+        self._action = np.zeros((count, self.spaces.action_size), np.float32)
+        self._pending = False  # whether actions were sent off whose records have not been asked for
+        self._workers: list[Worker] = []
+        for index in range(count):
+            if processes:
+                self._workers.append(OwnProcess(make, index, first.task, self.spaces, timeout))
+            else:
+                self._workers.append(InProcess(make, index, first.task, self.spaces, None if index else first))
         if processes:
-            with self._guard():
-                self._envs = AsyncVectorEnv(makers, context=_start_method(), autoreset_mode=AutoresetMode.NEXT_STEP)
-        else:
-            self._envs = SyncVectorEnv(makers, autoreset_mode=AutoresetMode.NEXT_STEP)
-        self.spaces: Spaces = self._envs.get_attr("spaces")[0]
+            first.close()
 
-    def reset(self, seeds: list[int]) -> Record:
+    def reset(self, seeds: Sequence[int]) -> Record:
         """The first records of new episodes, [N, ...] each."""
-        self._pending = True
-        with self._guard():
-            observation, _ = self._envs.reset(seed=list(seeds))
-        self._pending = False
-        nothing = np.zeros(self.count, bool)
-        self._is_last = nothing
-        return self._record(observation, np.zeros(self.count), np.ones(self.count, bool), nothing, nothing)
+        self._settle()
+        for worker, seed in enumerate(seeds):
+            self._begin(worker, self._fresh(seed))
+        return self._record(self._receive())
 
     def start(self, action: np.ndarray) -> None:
         """Sends flat actions [N, A]; where the last record was the last of an episode, the action is ignored."""
-        self._pending = True
-        with self._guard():
-            if isinstance(self._envs, AsyncVectorEnv):
-                self._envs.step_async(action)
-            else:
-                self._action = np.array(action)
+        self._action, self._pending = np.array(action, np.float32), True
+        for worker, own in zip(self._workers, self._action, strict=True):
+            worker.step(own)
 
     def finish(self) -> Record:
         """The records that follow the actions, [N, ...] each."""
-        with self._guard():
-            if isinstance(self._envs, AsyncVectorEnv):
-                observation, reward, terminated, truncated, _ = self._envs.step_wait()
-            else:
-                observation, reward, terminated, truncated, _ = self._envs.step(self._action)
         self._pending = False
-        is_first = self._is_last
-        self._is_last = terminated | truncated
-        return self._record(observation, reward, is_first, self._is_last, terminated)
-
-    def take_failures(self) -> list[Failure]:
-        return []
-
-    def histories(self) -> list[History | None]:
-        return [None] * self.count
-
-    def restore(self, histories: list[History | None]) -> Record | None:
-        return None
+        return self._record(self._receive())
 
     def step(self, action: np.ndarray) -> Record:
         """`start` and `finish` in one."""
         self.start(action)
         return self.finish()
 
-    def close(self) -> None:
-        if isinstance(self._envs, AsyncVectorEnv) and self._pending:
-            # Gymnasium would wait for answers that have been read already, or that a worker which is gone will never give.
-            for process in self._envs.processes:
-                process.kill()
-                process.join()
-            for pipe in self._envs.parent_pipes:
-                if pipe is not None:
-                    pipe.close()
-            self._envs.closed = True
-        else:
-            self._envs.close()
+    def histories(self) -> list[History | None]:
+        """What `restore` needs to come back to the last records, also while actions are on their way. [LOOP-34]
 
-    def _record(self, observation: Any, reward: np.ndarray, *flags: np.ndarray) -> Record:
-        """Everything in memory of its own: the vector environments keep and reuse their arrays."""
-        flags_by_name = {name: np.array(flag, bool) for name, flag in zip(FLAGS, flags, strict=True)}
-        return {**observation, "reward": np.array(reward, np.float32), **flags_by_name}
+        None for an episode that is too long to be kept.
+        """
+        return [self._episodes[worker].history() for worker in range(self.count)]
+
+    def restore(self, histories: Sequence[History | None]) -> Record | None:
+        """Plays every worker's episode again, and returns the last records: of deterministic environments those that `finish` had returned,
+        and from here on everything is as if nothing had been interrupted. [LOOP-34]
+
+        Returns:
+          The records [N, ...], to be compared with the saved ones; or None where a history is missing or cannot be replayed. Then, and
+          where they differ, `reset` must be called.
+        """
+        self._settle()
+        fitting = [history for history in histories if history and history.actions.shape[1:] == (self.spaces.action_size,)]
+        if len(fitting) != self.count:
+            return None
+        for worker, history in enumerate(fitting):
+            self._begin(worker, history)
+            self._action[worker] = history.actions[-1] if len(history.actions) else 0
+        steps, failures = self._ask(range(self.count))
+        for failure in failures:
+            self._end(failure)
+        return None if failures else self._record(steps)
+
+    def take_failures(self) -> list[Failure]:
+        """The failures since the last call."""
+        told, self._untold = self._untold, []
+        return told
+
+    def close(self) -> None:
+        """Ends everything, within seconds, whatever the environments do (unless they are in this process)."""
+        deadline = time.monotonic() + CLOSING
+        for worker in self._workers:
+            worker.shut()
+        for worker in self._workers:
+            worker.kill(deadline)
+
+    def _fresh(self, seed: int) -> History:
+        return History(seed, 0, np.zeros((0, self.spaces.action_size), np.float32))
+
+    def _settle(self) -> None:
+        """Takes the answers that nobody wants any more."""
+        if self._pending:
+            self.finish()
+
+    def _begin(self, worker: int, history: History) -> None:
+        self._workers[worker].begin(history)
+        self._episodes[worker] = Episode(history)
+
+    def _receive(self) -> dict[int, Step]:
+        """One step of every worker; those that fail are made anew until they give the first record of an episode: [LOOP-32]."""
+        steps, failures = self._ask(range(self.count))
+        while failures:
+            for failure in failures:
+                self._count(failure)
+                self._end(failure)
+                self._begin(failure.worker, self._fresh(derive_seed(self._episodes[failure.worker].seed, "restart", 0)))
+            again, failures = self._ask([failure.worker for failure in failures])
+            steps |= again
+        return steps
+
+    def _ask(self, workers: Iterable[int]) -> tuple[dict[int, Step], list[Failure]]:
+        """What the workers have done, and what went wrong."""
+        answers = receive({worker: self._workers[worker] for worker in workers})
+        steps = {worker: answer for worker, answer in answers.items() if not isinstance(answer, Failure)}
+        return steps, [answer for answer in answers.values() if isinstance(answer, Failure)]
+
+    def _count(self, failure: Failure) -> None:
+        """Raises a UserError where there were too many."""
+        self.failures += 1
+        self._untold.append(failure)
+        self._failed_at.append(self._records)
+        while self._failed_at[0] <= self._records - WINDOW:
+            self._failed_at.popleft()
+        if not self._records:
+            raise UserError(failure.message, failure.details)
+        if len(self._failed_at) > self._failures_allowed:
+            raise UserError(
+                f"{failure.message}; the environments failed {len(self._failed_at)} times within {WINDOW:,} records, "
+                f"and {self._failures_allowed} are allowed (--env-failures)",
+                failure.details,
+            )
+
+    def _end(self, failure: Failure) -> None:
+        worker = self._workers[failure.worker]
+        worker.shut()
+        worker.kill(time.monotonic() + (0 if failure.kind == "timeout" else CLOSING))
+
+    def _record(self, steps: Mapping[int, Step]) -> Record:
+        """The steps side by side, in memory of their own."""
+        for worker, episode in self._episodes.items():
+            if episode.is_last:
+                self._episodes[worker] = episode = episode.next()
+            episode.add(self._action[worker], is_last=bool(steps[worker][2] or steps[worker][3]))
+        self._records += self.count
+        observations, rewards, terminated, _, _ = zip(*(steps[worker] for worker in range(self.count)), strict=True)
+        return {
+            **{key: np.stack([observation[key] for observation in observations]) for key in self.spaces.observations},
+            "reward": np.array(rewards, np.float32),
+            "is_first": np.array([episode.records == 1 for episode in self._episodes.values()]),
+            "is_last": np.array([episode.is_last for episode in self._episodes.values()]),
+            "is_terminal": np.array(terminated, bool),
+        }
 
 
 def is_slow(make: Callable[[int], ContractEnv], seed: int) -> bool:
@@ -158,33 +209,3 @@ def is_slow(make: Callable[[int], ContractEnv], seed: int) -> bool:
         return (time.perf_counter() - start) / steps > SLOW_STEP
     finally:
         env.close()
-
-
-def _make_in_worker(make: Callable[[int], ContractEnv], index: int) -> ContractEnv:
-    if multiprocessing.parent_process() is not None:
-        for number in (signal.SIGINT, signal.SIGTERM):  # Sent to the whole group, they are for the trainer, which then closes its workers.
-            signal.signal(number, signal.SIG_IGN)
-    return make(index)
-
-
-def _start_method() -> str:
-    """Workers must not be forks of this process: a backend has threads in it."""
-    if sys.platform == "win32":
-        return "spawn"
-    multiprocessing.set_forkserver_preload(["train.envs"])
-    return "forkserver"
-
-
-@contextmanager
-def _worker_errors() -> Iterator[None]:
-    """Gymnasium warns about errors of its workers, with their traceback, before it raises them here. The error itself says all."""
-    level, gymnasium.logger.min_level = gymnasium.logger.min_level, gymnasium.logger.ERROR + 1
-    try:
-        yield
-    except (EOFError, ConnectionError) as error:
-        raise UserError(
-            "a process of an environment ended unexpectedly (killed, or out of memory?); what it said is above; "
-            "with --processes no the environments run in the trainer's own process"
-        ) from error
-    finally:
-        gymnasium.logger.min_level = level

@@ -53,16 +53,17 @@ class Prefetcher:
         self._drawn = self._draw(self.step)
         return batch
 
-    def write_back(self, ids: Any, latents: Mapping[str, Any], computed: Callable[[], None] = lambda: None) -> None:
+    def write_back(self, ids: Any, latents: Mapping[str, Any], computed: Callable[[], None] = lambda: None, skipped: Any = 0.0) -> None:
         """Hands over the latents of the train step whose batch was taken last. Does not wait for them: they may still be computed.
 
-        computed: called in the thread when they are there.
+        computed: called in the thread when they are there. skipped: the metric of that train step, which may still be computed too. Where
+        it is 1 the buffer stays as it is: [LOOP-43].
 
         Raises:
           whatever the write-back before has raised.
         """
         self._settle_write_back()
-        self._written = self._thread.submit(self._write_back, ids, dict(latents), computed)
+        self._written = self._thread.submit(self._write_back, ids, dict(latents), computed, skipped)
 
     def pack(self, steps: Mapping[str, Any]) -> Packed:
         """See Replay.pack."""
@@ -109,10 +110,11 @@ class Prefetcher:
     def _draw(self, step: int) -> "concurrent.futures.Future[Batch]":
         return self._thread.submit(lambda: self.replay.sample(self._uniform(step)))
 
-    def _write_back(self, ids: Any, latents: Mapping[str, Any], computed: Callable[[], None]) -> None:
+    def _write_back(self, ids: Any, latents: Mapping[str, Any], computed: Callable[[], None], skipped: Any) -> None:
         arrays = {name: np.asarray(value) for name, value in latents.items()}
         computed()
-        self.replay.write_back(ids, arrays)
+        if not float(skipped):
+            self.replay.write_back(ids, arrays)
 
     def _settle_draw(self) -> None:
         if self._drawn is not None:

@@ -1,0 +1,6 @@
+"""The commands of `conformance`.
+
+A module has a docstring, whose first line is its help, `add_arguments(parser)` and `main(console, options) -> exit code`.
+"""
+
+COMMANDS = ("check", "coverage", "mutants")

@@ -1,0 +1,37 @@
+"""`train report`: one HTML page about one run or many."""
+
+import os
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from train.cli import Parser
+from train.errors import UserError
+from train.report.page import render
+from train.report.runs import find_logdirs, read_run
+
+DESCRIPTION = """One HTML page about one run or many, which needs no network: results, curves, predictions, configuration, machine,
+and the command that gives the same run again. Runs that differ in their seed alone are drawn as one, with their spread.
+Runs may still be going on."""
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Writes the page.
+
+    Raises:
+      UserError: a directory without a run, or a page that cannot be written.
+    """
+    parser = Parser(prog="train report", description=DESCRIPTION, allow_abbrev=False)
+    parser.add_argument("logdirs", type=Path, nargs="+", metavar="LOGDIR", help="log directory of a run, or a directory that holds some")
+    parser.add_argument("--out", type=Path, default=Path("report.html"), metavar="FILE", help="the page (default report.html)")
+    options = parser.parse_args(arguments)
+    runs = [read_run(logdir) for logdir in find_logdirs(options.logdirs)]
+    page = render(runs, time.time()).encode()
+    temporary = options.out.with_name(f"{options.out.name}.tmp")
+    try:
+        temporary.write_bytes(page)
+        os.replace(temporary, options.out)
+    except OSError as error:
+        raise UserError(f"cannot write {options.out}: {error.strerror}; choose another file with --out") from error
+    print(f"{options.out}: {len(runs)} {'run' if len(runs) == 1 else 'runs'}, {len(page) / 1000:,.0f} kB")
+    return 0

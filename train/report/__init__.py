@@ -1,0 +1,1 @@
+"""`train report`: one HTML page about one run or many."""
