@@ -28,7 +28,7 @@ from conformance.problems import random_observations, small_config
 from spec import Discrete, Image, Spaces, Vector
 from train.checkpoint import FILES, open_checkpoint
 from train.errors import UserError
-from train.files import seal
+from train.files import read_arrays, read_json, seal
 from train.policy import DESCRIPTION, PARAMETERS, Policy, save
 from train.saved_agent import SavedAgent, agent_of
 
@@ -38,6 +38,11 @@ MEMORY = Path("/dev/shm") if Path("/dev/shm").is_dir() else None
 HEADROOM = 256 * 2**20  # bytes of address space beyond those of the process before the first mutant
 LONGEST = 20  # seconds for one mutant
 LONGEST_MESSAGE = 1000  # characters
+
+
+class TooLong(BaseException):
+    """A mutant takes longer than LONGEST seconds. Not a TimeoutError: that is an OSError, which a loader takes for a damaged file."""
+
 
 # Mutations of the bytes of a file
 
@@ -293,7 +298,7 @@ def run(seeds: range) -> dict[str, Any]:
     import resource
 
     def too_long(*_: Any) -> None:
-        raise TimeoutError(f"a mutant took longer than {LONGEST} seconds")
+        raise TooLong(f"longer than {LONGEST} seconds")
 
     signal.signal(signal.SIGALRM, too_long)
     counts: dict[str, collections.Counter[str]] = collections.defaultdict(collections.Counter)
@@ -326,6 +331,63 @@ def mutants(first: int, last: int) -> collections.Counter[str]:
     assert total.total() == last - first
     assert result["grown"] < 128, result
     return total
+
+
+def safetensors_file(header: str, data: bytes = b"") -> bytes:
+    return len(header).to_bytes(8, "little") + header.encode() + data
+
+
+def array(dtype: str, shape: list[int], length: int) -> str:
+    return f'"a": {{"dtype": "{dtype}", "shape": {shape}, "data_offsets": [0, {length}]}}'
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (safetensors_file(f"{{{array('F32', [1], 4)}, {array('I32', [1], 4)}}}", b"1234"), "the name 'a' occurs more than once"),
+        (safetensors_file(f"{{{array('BF16', [2], 4)}}}", b"1234"), "'a' has the dtype BF16; expected one of F64, F32"),
+        (safetensors_file(f"{{{array('F8_E4M3', [4], 4)}}}", b"1234"), "'a' has the dtype F8_E4M3"),
+        (safetensors_file(f"{{{array('F32', [0, 2**62], 0)}}}"), "'a' has the shape .* expected at most 8 axes"),
+        (safetensors_file(f"{{{array('F32', [1] * 70, 4)}}}", b"1234"), "'a' has the shape .* expected at most 8 axes"),
+        (safetensors_file(f"{{{array('F32', [2**40], 2**42)}}}", b"1234"), "file not fully covered"),
+        (safetensors_file(" " * 2**20 + "{}"), "the header says that it is 1,048,578 bytes long; expected at most 1,048,576"),
+        ((2**62).to_bytes(8, "little") + b"{}", "the header says that it is 4,611,686,018,427,387,904 bytes long"),
+        (safetensors_file('{"a":' * 10_000), "recursion"),
+        (b"", "header"),
+    ],
+)
+def test_what_safetensors_would_let_through_is_refused(content: bytes, message: str, tmp_path: Path) -> None:
+    """Its parser checks sizes, but not dtypes that NumPy lacks, sides that no array has, names that occur twice, and long headers."""
+    path = tmp_path / "file.safetensors"
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=message):
+        read_arrays(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('{"a": 1, "b": {"c": 1, "c": 1}}', "the name 'c' occurs more than once"),
+        ("[" * 100_000, "recursion"),
+        ("[]", "holds a list; expected an object"),
+        ('{"a": 9223372036854775808}', "9223372036854775808 is not a number of 64 bits"),
+        ('{"a": "\\ud800"}', "surrogates not allowed"),
+        (" " * 2**20 + "{}", "longer than 1,048,576 bytes"),
+    ],
+)
+def test_json_that_is_not_plain_is_refused(text: str, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "file.json"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=message):
+        read_json(path)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no named pipes in folders")
+@pytest.mark.parametrize("read", [read_json, read_arrays])
+def test_a_pipe_is_not_waited_for(read: Callable[[Path], Any], tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(ValueError, match="pipe is not a file"):
+        read(tmp_path / "pipe")
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="memory is limited as Linux does")
