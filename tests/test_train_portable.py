@@ -226,7 +226,7 @@ def test_a_run_that_changes_the_backend_goes_on(tmp_path: Path, capsys: pytest.C
 
     saved = open_checkpoint(tmp_path)
     counters = saved.info["counters"]
-    assert [counters[name] for name in ("records", "policy_steps", "starts")] == [900, 900, 3]
+    assert (counters["records"], counters["policy_steps"]) == (900, 900)
     assert counters["train_steps"] == 1 + (900 - (4 * 8 + 8)) * 16 // (4 * 8) == 431
     assert saved.info["replay_ratio"] == {"step": 900, "credit": "0"}
     with_latents = {"deter_dtype": saved.info["identity"]["replay_deter"], "classes": 4}
