@@ -182,7 +182,10 @@ class FakeLearner:
         self.diary.append(("train", {key: value.copy() for key, value in batch.items()}))
         shape = (self._config.batch_size, self._config.batch_length)
         deter = np.full((*shape, self._config.deter), 1000 + self._train_steps, np.float32)
-        return {"loss/total": np.float32(self.loss)}, {"deter": deter, "stoch": np.ones((*shape, self._config.stoch), np.int32)}
+        return {"loss/total": np.float32(self.loss), "skipped": np.float32(not np.isfinite(self.loss))}, {
+            "deter": deter,
+            "stoch": np.ones((*shape, self._config.stoch), np.int32),
+        }
 
     def predict(
         self, observation: Mapping[str, np.ndarray], prev_action: np.ndarray, is_first: np.ndarray, context: int, seed: int
@@ -200,6 +203,9 @@ class FakeLearner:
             "continue_": np.full(is_first.shape, 0.5),
             "reward": np.broadcast_to(np.arange(is_first.shape[1]), is_first.shape),
         }
+
+    def gradients(self, batch: Mapping[str, np.ndarray], seed: int) -> tuple[dict[str, float], dict[str, np.ndarray]]:
+        return {"loss/total": self.loss}, {"w": np.full((3, 2), self.loss, np.float32)}
 
     def state_dict(self) -> dict[str, np.ndarray]:
         return {

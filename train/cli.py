@@ -113,6 +113,8 @@ def build_parser() -> argparse.ArgumentParser:
         "--no-preflight", dest="preflight", action="store_false", default=None, help="skip the check of the backend before training"
     )
 
+    run.add_argument("--wandb", metavar="PROJECT", help="log to Weights & Biases too (pip install 'dreamer-spec[wandb]')")
+
     envs = parser.add_argument_group("environments")
     envs.add_argument("--action-repeat", type=_whole(1), metavar="N", help="apply each action N times (default 1)")
     envs.add_argument("--image-size", type=_whole(1), metavar="N", help="side to which images are resized, in pixels (default 64)")

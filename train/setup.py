@@ -3,13 +3,14 @@
 import functools
 import math
 from contextlib import ExitStack, closing
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from reference_numpy.training_loop import ReplayRatio, derive_seed
 from spec import Spaces, parameter_table
 from train import checkpoint, resume
+from train.about import write_about
 from train.backend import Learner, learner_class
 from train.checkpoint import Checkpoint
 from train.envs import ContractEnv, Environments, Record, is_slow, make_env
@@ -20,12 +21,15 @@ from train.options import Options
 from train.replay import Prefetcher, Replay, erase
 from train.state import Counters, Run, Scores
 
+if TYPE_CHECKING:
+    from conformance.preflight import Report
+
 
 def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -> Run:
     """Everything that can go wrong is tried here, the cheap things first. What must be closed is left to the stack."""
     _require_writable(options)
     _require_trainable(options)
-    display = Display(options.steps)
+    display = stack.enter_context(Display(options.steps))
     saved = _find_checkpoint(options, display)
     learner_type = learner or _import_learner(options.backend)
     envs, test_envs = _make_environments(options, stack)
@@ -33,10 +37,15 @@ def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -
         checkpoint.require_same_spaces(saved, envs.spaces.to_json())
     parameters = _count_parameters(options, envs.spaces)
     agent = _make_learner(learner_type, options, envs.spaces)  # Before preflight: it says what is wrong with the device.
-    if options.preflight:
-        _preflight(options, envs.spaces, display)
+    report = _preflight(options, envs.spaces, display) if options.preflight else None
     replay, saved, record = _open_replay(options, saved, envs, display)
-    starts = saved.info["counters"]["starts"] if saved else 0
+    starts, step = _progress(options, saved)
+    about = write_about(
+        options, spaces=envs.spaces, device=agent.device, parameters=parameters, preflight=report, resumed_at=step if saved else None
+    )
+    logger = Logger(options.logdir, saved.info["log"] if saved else None, wandb=options.wandb, about=about)
+    for line in logger.warnings:
+        display.say(f"WARNING: {line}")
     run = Run(
         options=options,
         envs=envs,
@@ -44,7 +53,7 @@ def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -
         learner=agent,
         replay=stack.enter_context(closing(replay)),
         ratio=ReplayRatio(options.config.replay_ratio, options.config.batch_size * options.config.batch_length),
-        logger=stack.enter_context(closing(Logger(options.logdir, saved.info["log"] if saved else None))),
+        logger=stack.enter_context(closing(logger)),
         display=display,
         counters=Counters(),
         scores=Scores(envs.count),
@@ -61,6 +70,13 @@ def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -
         _measure_random_policy(run)
     run.counters.starts += record is None
     return run
+
+
+def _progress(options: Options, saved: Checkpoint | None) -> tuple[int, int]:
+    """How often the environments began anew, and the environment step."""
+    if not saved:
+        return 0, 0
+    return saved.info["counters"]["starts"], saved.info["counters"]["records"] * options.action_repeat
 
 
 def _begin(options: Options, envs: Environments, starts: int) -> Record:
@@ -131,9 +147,10 @@ def _count_parameters(options: Options, spaces: Spaces) -> int:
         raise UserError(f"task {options.task}: {error}{remedy}") from error
 
 
-def _preflight(options: Options, spaces: Spaces, display: Display) -> None:
+def _preflight(options: Options, spaces: Spaces, display: Display) -> "Report":
     from conformance.preflight import preflight
 
+    display.phase("preflight")
     report = preflight(options.backend, spaces, options.config, options.device)
     if not report.passed:
         raise UserError(
@@ -141,6 +158,7 @@ def _preflight(options: Options, spaces: Spaces, display: Display) -> None:
             "Training would be in vain; --no-preflight skips this check"
         )
     display.say(f"preflight: {report.summary} (worst deviation {report.worst:.3g})")
+    return report
 
 
 def _make_learner(learner: type[Learner], options: Options, spaces: Spaces) -> Learner:
@@ -195,6 +213,7 @@ def _open_replay(
 
 def _measure_random_policy(run: Run) -> None:
     if run.options.random_episodes and run.test_envs:
+        run.display.phase("a random policy plays")
         returns = play_randomly(run.test_envs, run.options.random_episodes, run.options.seed)
         run.random_return = float(np.mean(returns))
         run.logger.write(0, 0.0, {"random/return": run.random_return})
