@@ -222,15 +222,22 @@ def test_a_reset_that_fails_too_is_tried_with_another_seed() -> None:
 
 @pytest.mark.parametrize("processes", [False, True])
 def test_a_reset_begins_everywhere_anew(make: Make, processes: bool) -> None:
-    """Whatever was before: records, restarts, actions whose records nobody asked for."""
+    """Whatever was before: the end of an episode, restarts, actions whose records nobody asked for."""
+
+    def begin() -> list[list[float]]:
+        records = [envs.reset([0, 1]), *(envs.step(calm(2)) for _ in range(EPISODE))]
+        assert [record["is_first"].tolist() for record in records] == [[True, True], *[[False, False]] * EPISODE]
+        assert records[-1]["is_last"].all()
+        # `Counting` numbers its episodes from when it was made; the random numbers are those of the seed.
+        return [record["observation"][:, 1].tolist() for record in records]
+
     envs = make("Fragile", 2, processes)
-    first = [envs.reset([0, 1]), *(envs.step(calm(2)) for _ in range(3))]
+    first = begin()
+    assert begin() == first
+    envs.step(calm(2))
     envs.step(trouble("error", 0, 2))
     envs.start(calm(2))
-    again = [envs.reset([0, 1]), *(envs.step(calm(2)) for _ in range(3))]
-    # `Counting` numbers its episodes from when it was made; the random numbers are those of the seed.
-    assert [record["observation"][:, 1].tolist() for record in again] == [record["observation"][:, 1].tolist() for record in first]
-    assert [record["is_first"].all() for record in again] == [True, False, False, False]
+    assert begin() == first
 
 
 @pytest.mark.parametrize(("task", "pending"), [("Fragile", True), ("Clinging", False), ("Counting", True)])
