@@ -13,7 +13,7 @@ from train import checkpoint, resume
 from train.about import write_about
 from train.backend import Learner, learner_class
 from train.checkpoint import Checkpoint
-from train.envs import ContractEnv, Environments, Record, is_slow, make_env
+from train.envs import Environments, Record, is_slow, make_env
 from train.errors import UserError
 from train.evaluation import play_randomly
 from train.logger import Display, Logger
@@ -124,7 +124,7 @@ def _import_learner(backend: str) -> type[Learner]:
 
 def _make_environments(options: Options, stack: ExitStack) -> tuple[Environments, Environments | None]:
     """The environments of training, and those of evaluation if there is any."""
-    make = functools.partial(_make_one, options)
+    make = functools.partial(make_env, options.task, image_size=options.image_size, action_repeat=options.action_repeat)
     count, processes = options.config.envs, options.processes == "yes"
     if options.processes == "auto" and count > 1:
         processes = is_slow(make, options.seed)
@@ -133,10 +133,6 @@ def _make_environments(options: Options, stack: ExitStack) -> tuple[Environments
     if not tests:
         return envs, None
     return envs, stack.enter_context(closing(Environments(make, tests, processes, options.env_timeout, options.env_failures)))
-
-
-def _make_one(options: Options, index: int) -> ContractEnv:
-    return make_env(options.task, index, options.image_size, options.action_repeat)
 
 
 def _count_parameters(options: Options, spaces: Spaces) -> int:
