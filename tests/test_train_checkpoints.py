@@ -87,6 +87,13 @@ def test_a_run_whose_environments_are_restored_continues_exactly(make: Make, cap
     assert resumed.envs.histories()[0].seed == derive_seed(0, "environment", 0)
 
 
+def test_a_run_is_continued_before_its_first_sequence_is_complete(make: Make) -> None:
+    """The buffer then has length 0, which is not the same as no buffer."""
+    options = make(task="gym:CartPole-v1", steps=2)
+    loop.run(options, FakeLearner)
+    assert len(stored(run_quietly(dataclasses.replace(options, steps=30)))) == 2
+
+
 def test_environments_that_lead_elsewhere_begin_anew(make: Make, capsys: pytest.CaptureFixture[str]) -> None:
     """`Counting` says how many episodes it has seen: in a new process, one."""
     loop.run(make(steps=46), FakeLearner)

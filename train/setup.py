@@ -57,7 +57,7 @@ def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -
         display=display,
         counters=Counters(),
         scores=Scores(envs.count),
-        record=record or _begin(options, envs, starts),
+        record=_begin(options, envs, starts) if record is None else record,
         carry=agent.initial_carry(envs.count),
     )
     display.say(
@@ -180,7 +180,7 @@ def _open_replay(
         "classes": config.classes,
     }
     replay = record = None
-    while saved and not replay:
+    while saved and replay is None:
         record = resume.restore_environments(saved, envs, display) if options.restore_envs else None
         try:
             replay = Replay.restore(
@@ -194,7 +194,7 @@ def _open_replay(
         except ValueError as error:
             resume.give_up(saved.path, error, display)
             saved = resume.find(options, display)
-    if replay:
+    if replay is not None:
         for line in replay.warnings:
             display.say(f"replay: {line}")
     else:
