@@ -63,12 +63,44 @@ def test_seeds_are_those_of_the_chapter_and_go_on_after_a_resume(make: Make) -> 
 
 
 def test_a_resumed_run_meets_new_episodes(make: Make) -> None:
-    """Its environments have seeds of their own: they do not begin as those of the first start did."""
-    options = make(task="gym:CartPole-v1", steps=40, replay_ratio=0)
+    """Where its environments are not restored, they have seeds of their own: they do not begin as those of the first start did."""
+    options = make(task="gym:CartPole-v1", steps=40, replay_ratio=0, restore_envs=False)
     loop.run(options, FakeLearner)
     streams = stored(run_quietly(dataclasses.replace(options, steps=80)))
     starts = {tuple(stream["observation"][0].tolist()) for stream in streams}
     assert len(starts) == len(streams) == 4
+
+
+@pytest.mark.covers("LOOP-21", "LOOP-23")
+def test_a_run_whose_environments_are_restored_continues_exactly(make: Make, capsys: pytest.CaptureFixture[str]) -> None:
+    """Streams, latents (the fake's carry counts steps), episodes and their scores are those of a run in one go."""
+    options = make(task="gym:CartPole-v1", steps=46)
+    whole = run_quietly(dataclasses.replace(options, steps=92, logdir=options.logdir / "whole"))
+    loop.run(options, FakeLearner)
+    resumed = run_quietly(dataclasses.replace(options, steps=92))
+    assert "continuing at step 46" in capsys.readouterr().out
+    assert resumed.counters.starts == 1
+    for stream, expected in zip(stored(resumed), stored(whole), strict=True):
+        assert stream.keys() == expected.keys()
+        assert [key for key in stream if stream[key].tobytes() != expected[key].tobytes()] == []
+    assert list(resumed.returns) == list(whole.returns)
+    assert resumed.envs.histories()[0].seed == derive_seed(0, "environment", 0)
+
+
+def test_a_run_is_continued_before_its_first_sequence_is_complete(make: Make) -> None:
+    """The buffer then has length 0, which is not the same as no buffer."""
+    options = make(task="gym:CartPole-v1", steps=2)
+    loop.run(options, FakeLearner)
+    assert len(stored(run_quietly(dataclasses.replace(options, steps=30)))) == 2
+
+
+def test_environments_that_lead_elsewhere_begin_anew(make: Make, capsys: pytest.CaptureFixture[str]) -> None:
+    """`Counting` says how many episodes it has seen: in a new process, one."""
+    loop.run(make(steps=46), FakeLearner)
+    resumed = run_quietly(make(steps=92))
+    assert "the environments are not deterministic" in capsys.readouterr().out
+    assert resumed.counters.starts == 2
+    assert len(stored(resumed)) == 4
 
 
 def test_metrics_after_the_checkpoint_are_dropped_on_resume(make: Make) -> None:

@@ -80,7 +80,7 @@ def test_the_same_command_continues(capsys: pytest.CaptureFixture[str]) -> None:
 )
 @pytest.mark.parametrize("processes", ["no", "yes"])
 def test_bad_environments(capsys: pytest.CaptureFixture[str], task: str, words: list[str], processes: str) -> None:
-    line = refusal(capsys, *FAST, "--task", task, "--processes", processes, "--random-episodes", "0")
+    line = refusal(capsys, *FAST, "--steps", "200", "--task", task, "--processes", processes, "--random-episodes", "0")
     assert all(word in line for word in words), line
 
 

@@ -1,5 +1,8 @@
 """Environments and a learner that the tests of `train` look through: every number that comes out says where it came from."""
 
+import multiprocessing
+import os
+import signal
 import time
 from collections.abc import Mapping
 from typing import Any, ClassVar
@@ -182,7 +185,10 @@ class FakeLearner:
         self.diary.append(("train", {key: value.copy() for key, value in batch.items()}))
         shape = (self._config.batch_size, self._config.batch_length)
         deter = np.full((*shape, self._config.deter), 1000 + self._train_steps, np.float32)
-        return {"loss/total": np.float32(self.loss)}, {"deter": deter, "stoch": np.ones((*shape, self._config.stoch), np.int32)}
+        return {"loss/total": np.float32(self.loss), "skipped": np.float32(not np.isfinite(self.loss))}, {
+            "deter": deter,
+            "stoch": np.ones((*shape, self._config.stoch), np.int32),
+        }
 
     def predict(
         self, observation: Mapping[str, np.ndarray], prev_action: np.ndarray, is_first: np.ndarray, context: int, seed: int
@@ -201,6 +207,9 @@ class FakeLearner:
             "reward": np.broadcast_to(np.arange(is_first.shape[1]), is_first.shape),
         }
 
+    def gradients(self, batch: Mapping[str, np.ndarray], seed: int) -> tuple[dict[str, float], dict[str, np.ndarray]]:
+        return {"loss/total": self.loss}, {"w": np.full((3, 2), self.loss, np.float32)}
+
     def state_dict(self) -> dict[str, np.ndarray]:
         return {
             "params/w": np.arange(6.0, dtype=np.float32).reshape(2, 3).T,  # not contiguous
@@ -212,3 +221,86 @@ class FakeLearner:
             raise ValueError(f"unexpected names {sorted(state)}")
         assert state["params/w"].tolist() == self.state_dict()["params/w"].tolist()
         self._train_steps = int(state["optimizer/step"])
+
+
+class Fragile(Counting):
+    """`Counting` whose second observation is random. An action whose second number is a key of TROUBLES gives that trouble instead."""
+
+    TROUBLES: ClassVar[dict[float, str]] = {0.25: "error", 0.5: "garbage", 0.75: "timeout", 1.0: "crash"}
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        observation, info = super().reset(seed=seed)
+        observation[1] = self.np_random.random()
+        return observation, info
+
+    def step(self, action: np.ndarray) -> Any:
+        trouble = self.TROUBLES.get(float(action[1]))
+        observation, reward, terminated, truncated, info = super().step(action)
+        observation[1] = self.np_random.random()
+        if trouble == "error":
+            raise ZeroDivisionError("inside\nthe environment")
+        if trouble == "garbage":
+            reward = np.nan
+        if trouble == "timeout":
+            time.sleep(60)
+        if trouble == "crash":
+            os.kill(os.getpid(), signal.SIGKILL)
+        return observation, reward, terminated, truncated, info
+
+
+class Clinging(Counting):
+    """Hangs when it is closed in a worker process."""
+
+    def close(self) -> None:
+        if multiprocessing.parent_process():
+            time.sleep(60)
+
+
+class Maze(gymnasium.Env[Any, Any]):
+    """Dict spaces, and chance in everything. An episode terminates by chance, or is truncated after 12 steps."""
+
+    observation_space = gym.Dict(
+        {
+            "view": gym.Box(0, 255, (8, 8, 3), np.uint8),
+            "body": gym.Dict({"place": gym.Discrete(7), "speed": gym.Box(-np.inf, np.inf, (2,), np.float64)}),
+        }
+    )
+    action_space = gym.Dict({"turn": gym.Discrete(3), "push": gym.Box(-2, 2, (2,), np.float32)})
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self._time, self._place, self._speed = 0, int(self.np_random.integers(7)), self.np_random.normal(size=2)
+        return self._observation(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self._time += 1
+        self._place = (self._place + int(action["turn"])) % 7
+        self._speed += action["push"] + self.np_random.normal(size=2)
+        return self._observation(), float(self._speed.sum()), self.np_random.random() < 0.05, self._time == 12, {}
+
+    def _observation(self) -> dict[str, Any]:
+        view = self.np_random.integers(0, 256, (8, 8, 3), np.uint8)
+        return {"view": view, "body": {"place": np.int64(self._place), "speed": self._speed}}
+
+
+class Unrepeatable(Counting):
+    """No two episodes are the same, whatever their seeds."""
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        observation, info = super().reset(seed=seed)
+        observation[1] = time.perf_counter() % 1
+        return observation, info
+
+
+class Shrinking(Counting):
+    """Its first episodes are shorter in every environment that is made."""
+
+    made: ClassVar[int] = 0
+
+    def __init__(self) -> None:
+        super().__init__()
+        type(self).made += 1
+
+    def step(self, action: np.ndarray) -> Any:
+        observation, reward, *_ = super().step(action)
+        return observation, reward, self._time >= 10 - self.made, False, {}

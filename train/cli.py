@@ -113,6 +113,8 @@ def build_parser() -> argparse.ArgumentParser:
         "--no-preflight", dest="preflight", action="store_false", default=None, help="skip the check of the backend before training"
     )
 
+    run.add_argument("--wandb", metavar="PROJECT", help="log to Weights & Biases too (pip install 'dreamer-spec[wandb]')")
+
     envs = parser.add_argument_group("environments")
     envs.add_argument("--action-repeat", type=_whole(1), metavar="N", help="apply each action N times (default 1)")
     envs.add_argument("--image-size", type=_whole(1), metavar="N", help="side to which images are resized, in pixels (default 64)")
@@ -125,11 +127,12 @@ def build_parser() -> argparse.ArgumentParser:
         "--env-failures", type=_whole(0), metavar="N", help="environments made anew, per 100,000 steps, that end the run (default 10)"
     )
     envs.add_argument(
-        "--restore-envs",
-        type=_boolean,
-        metavar="true|false",
-        help="a resumed run repeats the actions of the episodes under way, so that it continues exactly; false for an environment that "
-        "must not or cannot repeat them: new episodes begin (default true)",
+        "--no-restore-envs",
+        dest="restore_envs",
+        action="store_false",
+        default=None,
+        help="a resumed run begins new episodes; otherwise it repeats the actions of those under way, and continues exactly. For environments "
+        "that must not or cannot repeat them",
     )
 
     replay = parser.add_argument_group("replay")

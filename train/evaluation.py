@@ -34,7 +34,8 @@ def play(envs: Environments, act: Act, episodes: int, seeds: list[int], interrup
 def play_episodes(envs: Environments, act: Act, episodes: int, seeds: list[int], interrupted: Sequence[int] = ()) -> list[Episode]:
     """Scores and lengths of `episodes` whole episodes: [LOOP-20].
 
-    Each environment plays its share. The first `episodes` to end, wherever they do, would be the short ones.
+    Each environment plays its share. The first `episodes` to end, wherever they do, would be the short ones. An abandoned episode has no
+    return; another is played in its place.
 
     Raises:
       UserError: an episode that does not end.

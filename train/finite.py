@@ -1,11 +1,10 @@
-"""Numbers that are not finite: noticed, saved for inspection, and the end of the run, or skipped. [LOOP-12], [OPT-20]"""
-
-import math
+"""Numbers that are not finite: noticed, saved for inspection, and the end of the run, or skipped. [LOOP-12], [LOOP-40] to [LOOP-44]"""
 
 import numpy as np
 
 from train import checkpoint
 from train.errors import UserError
+from train.nonfinite import save_incident, stop_error
 from train.state import Run
 
 
@@ -19,17 +18,20 @@ def settle(run: Run) -> None:
     if step is None:
         return
     metrics = {name: float(value) for name, value in step.metrics.items()}
-    broken = [name for name, value in metrics.items() if _must_be_finite(name) and not math.isfinite(value)]
-    if not broken:
+    if not metrics["skipped"]:
         run.means.add(metrics)
     elif run.options.nonfinite == "skip":
-        run.means.add({"skipped": metrics["skipped"]})
+        run.means.add({"skipped": 1.0})
     else:
-        raise diverged(run, ", ".join(broken))
-
-
-def _must_be_finite(name: str) -> bool:
-    return "loss" in name or name == "gradient_norm"  # [OPT-20]
+        info = {
+            "train_step": step.number,
+            "step": run.step,
+            "backend": run.options.backend,
+            "identity": run.options.identity(),
+            "spaces": run.envs.spaces.to_json(),
+            "metrics": metrics,
+        }
+        raise stop_error(save_incident(run.options.logdir, run.learner, step.batch, step.seed, info), info)
 
 
 def mean_metrics(run: Run) -> dict[str, float]:

@@ -30,8 +30,7 @@ def run(options: Options, learner: type[Learner] | None = None) -> bool:
     """
     with ExitStack() as stack:
         run = prepare(options, learner, stack)
-        with run.display:
-            finished = train(run)
+        finished = train(run)
         if finished:
             finish(run)
         return finished
@@ -46,7 +45,7 @@ def train(run: Run) -> bool:
             schedule.attend(run)
             with run.clock.part("environments"):
                 run.record = run.envs.finish()
-            log_failures(run)
+            log_failures(run, run.envs)
             schedule.save(run)
         if run.interrupted:
             path = resume.save(run)
@@ -90,10 +89,15 @@ def learn(run: Run) -> None:
         ids = batch.pop("ids")
     number = run.counters.train_steps
     seed = derive_seed(run.options.seed, "train", number)
+    if not run.warm:
+        run.display.phase("the first train step, which JAX compiles")
+        run.warm = True
     with run.clock.part("train"):
         called = time.perf_counter()
         metrics, latents = run.learner.train_step(batch, seed)
-        run.replay.write_back(ids, latents, lambda: run.clock.computed(called))  # Waits until the step before is computed.
+        run.replay.write_back(
+            ids, latents, lambda: run.clock.computed(called), metrics["skipped"]
+        )  # Waits until the step before is computed.
         settle(run)
     run.counters.train_steps += 1
     run.unsettled = TrainStep(number, seed, batch, metrics)

@@ -8,12 +8,15 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from reference_numpy.training_loop import derive_seed
 from train import resume
 from train.curve import draw_curve
-from train.envs import Record
+from train.envs import Environments, Record
 from train.evaluation import Agent, Interrupted, evaluate
 from train.finite import finite_action, mean_metrics
 from train.logger import duration
+from train.pictures import draw_predictions
+from train.prediction import SequenceRecorder, predict, prediction_errors
 from train.state import Run
 
 
@@ -59,7 +62,11 @@ class Schedule:
         }
         self._logged_at, self._logged = now, dataclasses.replace(done)
         run.logger.write(run.step, done.seconds, {**mean_metrics(run), **speed, **run.clock.take(), **_state(run)})
-        run.display.update(run.step, _facts(run, steps, train_steps))
+        if done.train_steps:
+            run.display.update(run.step, _facts(run, steps, train_steps))
+        else:
+            config = run.options.config
+            run.display.phase("prefill", len(run.replay), config.batch_size * config.batch_length, "sequences")
 
 
 def _state(run: Run) -> dict[str, float]:
@@ -105,9 +112,9 @@ def log_episode(run: Run, score: float, length: int) -> None:
     run.logger.write(run.step, run.counters.seconds, {"episode/return": score, "episode/length": length})
 
 
-def log_failures(run: Run) -> None:
+def log_failures(run: Run, envs: Environments) -> None:
     """Environments that had to be made anew."""
-    for failure in run.envs.take_failures():
+    for failure in envs.take_failures():
         run.display.say(f"environment {failure.worker} was made anew, its episode is abandoned ({failure.kind}): {failure.message}")
 
 
@@ -117,20 +124,41 @@ def run_evaluation(run: Run) -> None:
     if not options.eval_episodes or not run.test_envs:
         return
     agent = Agent(run.learner, run.test_envs, options.seed, counters.evaluation_steps)
+    recorder, ended = SequenceRecorder(), 0
 
     def act(record: Record) -> np.ndarray:
-        return finite_action(run, agent(record))
+        nonlocal ended
+        ended += int(record["is_last"].sum())
+        run.display.phase("evaluation", min(ended, options.eval_episodes), options.eval_episodes, "episodes")
+        action = finite_action(run, agent(record))
+        recorder.add(record, action)
+        return action
 
     try:
         returns = evaluate(act, run.test_envs, options.eval_episodes, options.seed, counters.evaluations, run.interrupted)
     except Interrupted:
         return
+    finally:
+        log_failures(run, run.test_envs)
+    errors = show_predictions(run, recorder)
     counters.evaluations += 1
     counters.evaluation_steps = agent.step
     error = float(np.std(returns) / math.sqrt(len(returns)))
     run.evaluation = {"step": run.step, "return": float(np.mean(returns))}
     metrics = {"return": run.evaluation["return"], "return_standard_error": error, "return_min": min(returns), "return_max": max(returns)}
-    run.logger.write(run.step, counters.seconds, {f"evaluation/{name}": value for name, value in metrics.items()})
+    run.logger.write(run.step, counters.seconds, {f"evaluation/{name}": value for name, value in metrics.items()} | errors)
+
+
+def show_predictions(run: Run, recorder: SequenceRecorder) -> dict[str, float]:
+    """Draws what the world model predicts of an evaluation's episodes without seeing them. Returns how far off it is, as metrics."""
+    truth = recorder.sequences()
+    if truth is None:
+        return {}
+    spaces, seed = run.envs.spaces, derive_seed(run.options.seed, "prediction", run.counters.evaluations)
+    predicted = predict(run.learner, spaces, truth, seed)
+    for name, path in draw_predictions(run.options.logdir / "predictions", run.step, spaces, truth, predicted).items():
+        run.logger.picture(f"prediction/{name}", path, run.step)
+    return prediction_errors(spaces, truth, predicted)
 
 
 def finish(run: Run) -> None:

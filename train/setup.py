@@ -3,16 +3,17 @@
 import functools
 import math
 from contextlib import ExitStack, closing
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from reference_numpy.training_loop import ReplayRatio, derive_seed
 from spec import Spaces, parameter_table
 from train import checkpoint, resume
+from train.about import write_about
 from train.backend import Learner, learner_class
 from train.checkpoint import Checkpoint
-from train.envs import ContractEnv, Environments, Record, is_slow, make_env
+from train.envs import Environments, Record, is_slow, make_env
 from train.errors import UserError
 from train.evaluation import play_randomly
 from train.logger import Display, Logger
@@ -20,12 +21,15 @@ from train.options import Options
 from train.replay import Prefetcher, Replay, erase
 from train.state import Counters, Run, Scores
 
+if TYPE_CHECKING:
+    from conformance.preflight import Report
+
 
 def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -> Run:
     """Everything that can go wrong is tried here, the cheap things first. What must be closed is left to the stack."""
     _require_writable(options)
     _require_trainable(options)
-    display = Display(options.steps)
+    display = stack.enter_context(Display(options.steps))
     saved = _find_checkpoint(options, display)
     learner_type = learner or _import_learner(options.backend)
     envs, test_envs = _make_environments(options, stack)
@@ -33,10 +37,15 @@ def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -
         checkpoint.require_same_spaces(saved, envs.spaces.to_json())
     parameters = _count_parameters(options, envs.spaces)
     agent = _make_learner(learner_type, options, envs.spaces)  # Before preflight: it says what is wrong with the device.
-    if options.preflight:
-        _preflight(options, envs.spaces, display)
+    report = _preflight(options, envs.spaces, display) if options.preflight else None
     replay, saved, record = _open_replay(options, saved, envs, display)
-    starts = saved.info["counters"]["starts"] if saved else 0
+    starts, step = _progress(options, saved)
+    about = write_about(
+        options, spaces=envs.spaces, device=agent.device, parameters=parameters, preflight=report, resumed_at=step if saved else None
+    )
+    logger = Logger(options.logdir, saved.info["log"] if saved else None, wandb=options.wandb, about=about)
+    for line in logger.warnings:
+        display.say(f"WARNING: {line}")
     run = Run(
         options=options,
         envs=envs,
@@ -44,11 +53,11 @@ def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -
         learner=agent,
         replay=stack.enter_context(closing(replay)),
         ratio=ReplayRatio(options.config.replay_ratio, options.config.batch_size * options.config.batch_length),
-        logger=stack.enter_context(closing(Logger(options.logdir, saved.info["log"] if saved else None))),
+        logger=stack.enter_context(closing(logger)),
         display=display,
         counters=Counters(),
         scores=Scores(envs.count),
-        record=record or _begin(options, envs, starts),
+        record=_begin(options, envs, starts) if record is None else record,
         carry=agent.initial_carry(envs.count),
     )
     display.say(
@@ -61,6 +70,13 @@ def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -
         _measure_random_policy(run)
     run.counters.starts += record is None
     return run
+
+
+def _progress(options: Options, saved: Checkpoint | None) -> tuple[int, int]:
+    """How often the environments began anew, and the environment step."""
+    if not saved:
+        return 0, 0
+    return saved.info["counters"]["starts"], saved.info["counters"]["records"] * options.action_repeat
 
 
 def _begin(options: Options, envs: Environments, starts: int) -> Record:
@@ -108,7 +124,7 @@ def _import_learner(backend: str) -> type[Learner]:
 
 def _make_environments(options: Options, stack: ExitStack) -> tuple[Environments, Environments | None]:
     """The environments of training, and those of evaluation if there is any."""
-    make = functools.partial(_make_one, options)
+    make = functools.partial(make_env, options.task, image_size=options.image_size, action_repeat=options.action_repeat)
     count, processes = options.config.envs, options.processes == "yes"
     if options.processes == "auto" and count > 1:
         processes = is_slow(make, options.seed)
@@ -119,10 +135,6 @@ def _make_environments(options: Options, stack: ExitStack) -> tuple[Environments
     return envs, stack.enter_context(closing(Environments(make, tests, processes, options.env_timeout, options.env_failures)))
 
 
-def _make_one(options: Options, index: int) -> ContractEnv:
-    return make_env(options.task, index, options.image_size, options.action_repeat)
-
-
 def _count_parameters(options: Options, spaces: Spaces) -> int:
     try:
         return sum(math.prod(parameter.shape) for parameter in parameter_table(options.config, spaces).values())
@@ -131,9 +143,10 @@ def _count_parameters(options: Options, spaces: Spaces) -> int:
         raise UserError(f"task {options.task}: {error}{remedy}") from error
 
 
-def _preflight(options: Options, spaces: Spaces, display: Display) -> None:
+def _preflight(options: Options, spaces: Spaces, display: Display) -> "Report":
     from conformance.preflight import preflight
 
+    display.phase("preflight")
     report = preflight(options.backend, spaces, options.config, options.device)
     if not report.passed:
         raise UserError(
@@ -141,6 +154,7 @@ def _preflight(options: Options, spaces: Spaces, display: Display) -> None:
             "Training would be in vain; --no-preflight skips this check"
         )
     display.say(f"preflight: {report.summary} (worst deviation {report.worst:.3g})")
+    return report
 
 
 def _make_learner(learner: type[Learner], options: Options, spaces: Spaces) -> Learner:
@@ -166,7 +180,7 @@ def _open_replay(
         "classes": config.classes,
     }
     replay = record = None
-    while saved and not replay:
+    while saved and replay is None:
         record = resume.restore_environments(saved, envs, display) if options.restore_envs else None
         try:
             replay = Replay.restore(
@@ -180,7 +194,7 @@ def _open_replay(
         except ValueError as error:
             resume.give_up(saved.path, error, display)
             saved = resume.find(options, display)
-    if replay:
+    if replay is not None:
         for line in replay.warnings:
             display.say(f"replay: {line}")
     else:
@@ -195,6 +209,7 @@ def _open_replay(
 
 def _measure_random_policy(run: Run) -> None:
     if run.options.random_episodes and run.test_envs:
+        run.display.phase("a random policy plays")
         returns = play_randomly(run.test_envs, run.options.random_episodes, run.options.seed)
         run.random_return = float(np.mean(returns))
         run.logger.write(0, 0.0, {"random/return": run.random_return})

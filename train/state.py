@@ -93,6 +93,7 @@ class Run:
     clock: Clock = dataclasses.field(default_factory=Clock)
     means: Means = dataclasses.field(default_factory=Means)  # of the train steps since the last line of metrics
     unsettled: TrainStep | None = None  # the newest train step
+    warm: bool = False  # whether a train step has been made since the process began
     random_return: float | None = None
     evaluation: dict[str, float] | None = None  # of the last evaluation: step, return
     returns: collections.deque[float] = dataclasses.field(default_factory=lambda: collections.deque(maxlen=20))  # of the last episodes

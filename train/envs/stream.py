@@ -112,10 +112,12 @@ class Stream(gymnasium.Env[Observation, np.ndarray]):
 
     def _failed(self, error: Exception) -> Step:
         """A failure in the info: as an exception it would lose its traceback on its way through Gymnasium."""
-        message, details = str(error), error.details if isinstance(error, UserError) else traceback.format_exc()
-        if not isinstance(error, UserError):
-            message = f"{where(self._task, self._index, self._steps)}: the environment raised {type(error).__name__}: {error}"
-        failure = Failure(self._index, "garbage" if isinstance(error, Garbage) else "error", message, details)
+        if isinstance(error, UserError):
+            failure = Failure(self._index, "garbage" if isinstance(error, Garbage) else "error", str(error), error.details)
+        else:
+            place = where(self._task, self._index, self._steps)
+            message = f"{place}: the environment raised {type(error).__name__}: {error}"
+            failure = Failure(self._index, "error", message, traceback.format_exc())
         return self._nothing, 0.0, False, False, {"failure": failure}
 
     def shut(self) -> None:
