@@ -131,8 +131,8 @@ def build_parser() -> argparse.ArgumentParser:
         dest="restore_envs",
         action="store_false",
         default=None,
-        help="a resumed run begins new episodes; otherwise it repeats the actions of those under way, and continues exactly. For environments "
-        "that must not or cannot repeat them",
+        help="a resumed run begins new episodes; otherwise it repeats the actions of those under way, and continues exactly. "
+        "For environments that must not or cannot repeat them",
     )
 
     replay = parser.add_argument_group("replay")
