@@ -108,7 +108,7 @@ def candidate(name: str | None, command: str | None, dtype: str, device: str | N
 
 
 def remarks(adapter: object) -> list[str]:
-    """What somebody else's adapter says of itself, and what its author may have overlooked: names that are nearly those of the interface."""
+    """What somebody else's adapter says of itself, and names that are nearly those of the interface."""
     if not isinstance(adapter, ModuleAdapter | ProcessAdapter):
         return []
     edition = adapter.edition()

@@ -23,7 +23,7 @@ from typing import IO, Any
 from conformance.check import CandidateLost
 from conformance.errors import UserError
 from conformance.foreign import ForeignAdapter
-from conformance.serve import PROTOCOL, BadMessage, decode, encode
+from conformance.serve import PROTOCOL, BadMessage, decode, encode, to_numpy
 
 RESTARTS = 5
 BABBLE_LINES = 100
@@ -185,8 +185,8 @@ class ProcessAdapter(ForeignAdapter):
         """Raises what the implementation raised, or `CandidateLost`."""
         result = self._ask("run", function=name, args=[encode_argument(argument) for argument in arguments])
         try:
-            return decode(result)
-        except BadMessage as error:
+            return to_numpy(decode(result))
+        except (BadMessage, TypeError) as error:
             raise CandidateError(f"{name}: {error}") from error
 
     def edition(self) -> str | None:

@@ -40,7 +40,7 @@ HOOKS = tuple(name for name, hook in vars(Hooks).items() if inspect.isfunction(h
 
 
 def functions_by_row() -> dict[str, list[str]]:
-    """Row of the grid -> the functions of the interface that belong to it. What the reference lacks belongs to the row of the one before."""
+    """Row of the grid -> its functions of the interface. What the reference lacks belongs to the row of the one before."""
     modules = {row: importlib.import_module(f"reference_numpy.{row}") for row in ROWS}
     found: dict[str, list[str]] = {row: [] for row in ROWS}
     current = ROWS[0]
