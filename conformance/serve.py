@@ -73,8 +73,8 @@ def encode(value: Any) -> Any:
     """A value in plain JSON types: arrays as {"dtype", "shape", "data"}, mappings as {"map": ...}, NaN and infinities as arrays."""
     if value is None or isinstance(value, (bool, int, str)):
         return value
-    if isinstance(value, float) and math.isfinite(value):
-        return float(value)
+    if isinstance(value, float) and math.isfinite(value) and not isinstance(value, np.generic):
+        return value
     if isinstance(value, Mapping):
         return {"map": {str(key): encode(entry) for key, entry in value.items()}}
     if isinstance(value, (tuple, list)):
@@ -161,8 +161,8 @@ def convert_arrays(value: Any, convert: Any) -> Any:
     """The argument with `convert` applied to every array in it; None leaves all as they are."""
     if convert is None:
         return value
-    if isinstance(value, np.ndarray):
-        return convert(value)
+    if isinstance(value, (np.ndarray, np.generic)):
+        return convert(np.asarray(value))
     if isinstance(value, Mapping):
         return {key: convert_arrays(entry, convert) for key, entry in value.items()}
     if isinstance(value, (tuple, list)):

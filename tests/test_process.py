@@ -90,7 +90,8 @@ def test_the_format_of_an_array() -> None:
     assert encode(np.array([1.0, -2.0], np.float32)) == expected
     assert encode(np.array([1.0, -2.0], ">f4")) == expected
     np.testing.assert_array_equal(decode(expected), np.array([1.0, -2.0]))
-    assert encode(math.nan)["shape"] == []
+    assert encode(math.nan)["shape"] == encode(np.float64(0.5))["shape"] == []
+    assert encode(0.5) == 0.5
 
 
 def test_configurations_and_spaces() -> None:

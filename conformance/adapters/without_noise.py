@@ -1,6 +1,6 @@
 """What an implementation offers that takes no noise, made of the functions of one that does."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,8 +12,10 @@ from spec import Config, Discrete, Spaces, parameter_table
 class WithoutNoise:
     """For adapters: given samples are turned into noise that draws them, and drawn samples come from noise of NumPy's generator."""
 
-    def __getattr__(self, name: str) -> Any:
-        raise AttributeError(name)  # the functions that take noise are those of the subclass
+    if TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            """The functions that take noise are those of the other base class."""
 
     def observe_given(
         self, params: Any, carry: Any, tokens: np.ndarray, prev_action: np.ndarray, is_first: np.ndarray, stoch: np.ndarray, config: Config
