@@ -13,14 +13,17 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import jsonschema
 import numpy as np
 import pytest
 
 from conformance import process
+from conformance.adapter import OBJECTS
+from conformance.adapters.numpy_adapter import NumpyAdapter
 from conformance.check import CandidateLost
 from conformance.cli import main
 from conformance.errors import UserError
-from conformance.execute import Result, run_check, selected_checks
+from conformance.execute import Result, missing, run_check, selected_checks
 from conformance.problems import small_config, spaces
 from conformance.process import RESTARTS, CandidateError, ProcessAdapter, encode_argument
 from conformance.serve import BadMessage, decode, encode, to_numpy
@@ -323,3 +326,29 @@ def test_other_dtypes_are_converted() -> None:
     for wrong in (None, "text", np.array(["text"]), np.array([1j]), [1.0, None], object()):
         with pytest.raises(TypeError, match="expected numbers"):
             to_numpy(wrong)
+
+
+@pytest.mark.slow
+def test_every_check_works_through_a_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The reference behind the door passes all checks but those of objects with methods, and every request of these is valid."""
+    schema = json.loads((ROOT / "conformance" / "protocol.schema.json").read_text(encoding="utf-8"))
+    validator = jsonschema.Draft202012Validator({"$ref": "#/$defs/request", "$defs": schema["$defs"]})
+    send, requests = process.Connection.send, 0
+
+    def validated(connection: process.Connection, message: Any) -> None:
+        nonlocal requests
+        requests += 1
+        validator.validate(message)
+        send(connection, message)
+
+    monkeypatch.setattr(process.Connection, "send", validated)
+    adapter = ProcessAdapter(
+        shlex.join([sys.executable, "-m", "conformance.serve", str(FAKE.parent / "reference_adapter.py")]), "float64", 60.0
+    )
+    results = [run_check(check, adapter, "float64", "paper", examples=1) for check in CHECKS.values()]
+    adapter.close()
+    assert [result.message for result in results if result.status in ("fail", "error")] == []
+    reference = NumpyAdapter()
+    asked = {check.name for check in CHECKS.values() if not missing(reference, check) and not set(check.uses) & set(OBJECTS)}
+    assert {result.check.name for result in results if result.status == "pass"} == asked
+    assert requests > len(asked)
