@@ -3,9 +3,12 @@
 An adapter is any object or module with some of the functions below, NumPy in and NumPy out. Every function is optional: what is missing
 is reported as not offered. Shapes and meanings are those of the reference function of the same name; the chapter of the row defines them.
 Parameters are the flat mapping of canonical names (spec/parameters.py), a state is the training state of [AGT], noise is an argument.
+Functions named `..._given` are the same without noise: they take the samples instead. Functions named `draw_...` sample with a generator
+of their own, made from a seed. How to write an adapter is in docs/adapters.md.
 """
 
 import importlib
+import inspect
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
@@ -47,6 +50,28 @@ class Adapter(Protocol):
     def normal_entropy(self, std: Array) -> Array: ...
     def mse_loss(self, prediction: Array, target: Array) -> Array: ...
     def symlog_mse_loss(self, prediction: Array, target: Array, scale: float) -> Array: ...
+    def draw_categorical(self, logits: Array, unimix: float, seed: int, n: int) -> Array:
+        """Independent samples of a categorical mixed with the uniform distribution.
+
+        Args:
+          logits: [S, C], before the mixture.
+          unimix: share of the uniform distribution, 0 to 1.
+          seed, n: of the generator, and how many samples.
+
+        Returns:
+          [n, S, C], one-hots; or [n, S], whole numbers below C.
+        """
+
+    def draw_normal(self, mean: Array, std: Array, seed: int, n: int) -> Array:
+        """Independent samples of a normal.
+
+        Args:
+          mean, std: [D].
+          seed, n: of the generator, and how many samples.
+
+        Returns:
+          [n, D].
+        """
 
     # layers
     def linear(self, x: Array, kernel: Array, bias: Array) -> Array: ...
@@ -69,7 +94,45 @@ class Adapter(Protocol):
         self, params: Arrays, carry: Arrays, tokens: Array, prev_action: Array, is_first: Array, uniform: Array, config: Config
     ) -> Arrays: ...
     def imagine(self, params: Arrays, carry: Arrays, action: Array, uniform: Array, config: Config) -> Arrays:
-        """Imagination under given actions [N, H, A], in place of a policy."""
+        """Imagination under given actions.
+
+        Args:
+          params: `rssm/...`.
+          carry: "deter" [N, D] and "stoch" [N, S, C], the states to start from.
+          action: [N, H, A], in place of a policy.
+          uniform: [N, H, S], numbers in [0, 1); entry t draws the latents of state t + 1.
+
+        Returns:
+          "deter" [N, H+1, D], "stoch" [N, H+1, S, C] and "action" [N, H, A].
+        """
+
+    def observe_given(
+        self, params: Arrays, carry: Arrays, tokens: Array, prev_action: Array, is_first: Array, stoch: Array, config: Config
+    ) -> Arrays:
+        """A sequence of observations with given latents: what `observe` computes, up to the logits.
+
+        Args:
+          params: `rssm/...`.
+          carry: "deter" [B, D] and "stoch" [B, S, C] of the step before the first one.
+          tokens, prev_action, is_first: [B, T, E], [B, T, A] and [B, T], as `observe` takes them.
+          stoch: [B, T, S, C], one-hot; entry t is the latent of step t, which step t + 1 goes on from.
+
+        Returns:
+          "deter" [B, T, D], "posterior" and "prior" [B, T, S, C], the logits of both from the memory of that step.
+        """
+
+    def imagine_given(self, params: Arrays, carry: Arrays, action: Array, stoch: Array, config: Config) -> Arrays:
+        """Imagination under given actions and with given latents.
+
+        Args:
+          params: `rssm/...`.
+          carry: "deter" [N, D] and "stoch" [N, S, C], the states to start from.
+          action: [N, H, A].
+          stoch: [N, H, S, C], one-hot; entry t is the latent of state t + 1.
+
+        Returns:
+          "deter" [N, H+1, D], and "prior" [N, H, S, C], where entry t is the logits of state t + 1.
+        """
 
     # networks
     def encoder(self, params: Arrays, observations: Arrays, spaces: Spaces, config: Config) -> Array: ...
@@ -115,6 +178,16 @@ class Adapter(Protocol):
     def critic_loss(self, logits: Array, slow_logits: Array, returns: Array, weight: Array, config: Config) -> Array: ...
     def replay_critic_loss(self, logits: Array, slow_logits: Array, returns: Array, is_last: Array, config: Config) -> Array: ...
     def update_slow_critic(self, slow: Arrays, critic: Arrays, decay: float) -> Arrays: ...
+    def draw_actions(self, outputs: Nested, spaces: Spaces, config: Config, seed: int, n: int) -> Array:
+        """Independent samples of the policy at one state.
+
+        Args:
+          outputs: action key -> {"logits": [sum of classes]} or {"mean", "std": [size]}, the actor's raw outputs.
+          seed, n: of the generator, and how many samples.
+
+        Returns:
+          [n, A], flat actions.
+        """
 
     # optimizer
     def adaptive_gradient_clip(self, gradient: Array, parameter: Array, clip: float, epsilon: float) -> Array: ...
@@ -124,6 +197,13 @@ class Adapter(Protocol):
 
     # agent
     def initial_parameters(self, table: Mapping[str, Parameter], uniforms: Arrays) -> Arrays: ...
+    def draw_parameters(self, spaces: Spaces, config: Config, seed: int) -> Arrays:
+        """Fresh parameters by the implementation's own initializer and generator.
+
+        Returns:
+          Canonical name -> array, for exactly the names of `spec.parameter_table(config, spaces)`.
+        """
+
     def initial_state(self, params: Arrays) -> Nested: ...
     def policy_step(
         self,
@@ -168,6 +248,28 @@ class Adapter(Protocol):
     ) -> tuple[Nested, Nested]:
         """The same with given gradients, for implementations without automatic differentiation."""
 
+    def losses_given(
+        self, params: Arrays, slow_critic: Arrays, return_range: Range, batch: Arrays, samples: Arrays, spaces: Spaces, config: Config
+    ) -> tuple[float, Nested]:
+        """`losses` with given samples in place of the noise.
+
+        Args:
+          params, slow_critic, return_range, batch: as `losses` takes them.
+          samples: "posterior" [B, T, S, C] and "prior" [N, H, S, C], one-hot, and "action" [N, H, A], flat, with N = B*T. Gradients are
+            those of samples: straight through "posterior", none into the others.
+
+        Returns:
+          The total and the aux of `losses`.
+        """
+
+    def gradients_given(
+        self, params: Arrays, slow_critic: Arrays, return_range: Range, batch: Arrays, samples: Arrays, spaces: Spaces, config: Config
+    ) -> Arrays:
+        """d total / d params of `losses_given`, by name."""
+
+    def train_step_given(self, state: Nested, batch: Arrays, samples: Arrays, spaces: Spaces, config: Config) -> tuple[Nested, Nested]:
+        """`train_step` with given samples in place of the noise: see `losses_given`."""
+
     # replay and training loop: shared by all backends. The classes have the constructors and methods of the reference's.
     def Replay(self, capacity: int, length: int) -> Any: ...  # noqa: N802
     def ReplayRatio(self, replay_ratio: float, batch_steps: int) -> Any: ...  # noqa: N802
@@ -179,6 +281,41 @@ class Adapter(Protocol):
     def environment_action(self, action: Array, spaces: Spaces, low: Arrays, high: Arrays) -> Arrays: ...
     def derive_seed(self, seed: int, purpose: str, index: int) -> int: ...
 
+
+class Hooks(Protocol):
+    """What else an adapter may hold. No check asks for these."""
+
+    def setup(self, dtype: str) -> None:
+        """Called once before all checks, with the precision to compute in: "float64", "float32" or "bfloat16"."""
+
+    def edition(self) -> str | None:
+        """The edition or profile that the implementation claims to be, for example "official"; None for no claim."""
+
+    def convert(self, array: Array) -> Any:
+        """Called on every array before it is handed to a function: `convert = torch.as_tensor`."""
+
+
+INTERFACE: dict[str, tuple[str, ...]] = {
+    name: tuple(inspect.signature(function).parameters)[1:]
+    for name, function in vars(Adapter).items()
+    if inspect.isfunction(function) and not name.startswith("_")
+}
+"""Every function that the checks know -> the names of its arguments, which are given by position."""
+
+OBJECTS = ("Replay", "ReplayRatio")
+"""Functions of the interface that return objects with methods, and no numbers."""
+
+RESULTS: dict[str, tuple[str, ...]] = {
+    "bounded_normal": ("mean", "std"),
+    "kl_losses": ("dynamics", "representation"),
+    "update_return_range": ("low", "high"),
+    "laprop": ("update", "second_moment", "momentum"),
+    "optimizer_step": ("params", "state"),
+    "policy_step": ("carry", "action"),
+    **dict.fromkeys(("losses", "losses_given"), ("total", "aux")),
+    **dict.fromkeys(("train_step", "train_step_with", "train_step_given"), ("state", "aux")),
+}
+"""Functions with several results -> what these are, in their order."""
 
 COLUMNS = ("numpy", "jax", "torch")
 

@@ -1,16 +1,68 @@
 """From what a command line names to an adapter."""
 
+import contextlib
+import difflib
 import importlib
-import importlib.util
+import inspect
 import sys
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
-from conformance.adapter import COLUMNS, load_adapter
+from conformance.adapter import COLUMNS, INTERFACE, OBJECTS, load_adapter
 from conformance.errors import UserError
+from conformance.foreign import ForeignAdapter
+from conformance.process import ProcessAdapter
+from conformance.serve import convert_arrays, load_file, to_numpy
+
+
+class ModuleAdapter(ForeignAdapter):
+    """The functions of a module. Arrays go in through its `convert`, if it has one, and come out as NumPy."""
+
+    def __init__(self, module: ModuleType, dtype: str) -> None:
+        self._module = module
+        self.name, self.version = module.__name__, str(getattr(module, "__version__", ""))
+        getattr(module, "setup", lambda dtype: None)(dtype)
+
+    def offers(self, name: str) -> bool:
+        return callable(getattr(self._module, name, None))
+
+    def call(self, name: str, arguments: tuple[Any, ...]) -> Any:
+        function = getattr(self._module, name)
+        _require_arguments(name, function)
+        convert = getattr(self._module, "convert", None)
+        result = function(*(convert_arrays(argument, convert) for argument in arguments))
+        try:
+            return result if name in OBJECTS else to_numpy(result)
+        except TypeError as error:
+            raise TypeError(f"{name}: {error}") from error
+
+    def edition(self) -> str | None:
+        return getattr(self._module, "edition", lambda: None)()
+
+    @property
+    def names(self) -> list[str]:
+        """The public functions that the module itself defines."""
+        own = [name for name, value in vars(self._module).items() if getattr(value, "__module__", None) == self._module.__name__]
+        return [name for name in own if not name.startswith("_")]
+
+
+def _require_arguments(name: str, function: Any) -> None:
+    """Raises TypeError, naming the arguments, unless the function takes those of the interface by position."""
+    expected = INTERFACE[name]
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):
+        return  # a built-in function does not tell
+    try:
+        signature.bind(*expected)
+    except TypeError as error:
+        raise TypeError(f"{name} is called with ({', '.join(expected)}), in this order; yours takes {signature}") from error
 
 
 def load_candidate(name: str, dtype: str, device: str | None = None) -> object:
-    """The adapter of one of our columns, or a module or file of somebody's own. dtype, device: of our columns.
+    """The adapter of one of our columns, or a module or file of somebody's own. device: of our columns.
 
     Raises:
       UserError: there is no such thing, or what it needs is not there. A mistake inside of somebody's module keeps its traceback.
@@ -23,23 +75,49 @@ def load_candidate(name: str, dtype: str, device: str | None = None) -> object:
         except (ValueError, RuntimeError) as error:
             raise UserError(str(error).partition("\n")[0]) from error
     if name.endswith(".py"):
-        return _load_file(Path(name))
+        if not Path(name).exists():
+            raise UserError(f"no file {name}; `conformance new-adapter {name}` writes one to fill in")
+        return ModuleAdapter(load_file(Path(name)), dtype)
     sys.path.insert(0, "")
     try:
-        return importlib.import_module(name)
+        return ModuleAdapter(importlib.import_module(name), dtype)
     except ModuleNotFoundError as error:
         if error.name is None or not f"{name}.".startswith(f"{error.name}."):
             raise
         raise UserError(f"no module named {name!r}; give one of {', '.join(COLUMNS)}, a module on PYTHONPATH, or a .py file") from error
 
 
-def _load_file(path: Path) -> object:
-    if not path.exists():
-        raise UserError(f"no file {path}")
-    sys.path.insert(0, str(path.resolve().parent))
-    specification = importlib.util.spec_from_file_location(path.stem, path)
-    assert specification is not None
-    assert specification.loader is not None
-    module = importlib.util.module_from_spec(specification)
-    specification.loader.exec_module(module)
-    return module
+@contextlib.contextmanager
+def candidate(name: str | None, command: str | None, dtype: str, device: str | None, timeout: float) -> Iterator[object]:
+    """An adapter while it is needed: of `load_candidate`, or of the process that a command starts.
+
+    Raises:
+      UserError: neither or both are given, or there is no such candidate.
+    """
+    if (name is None) == (command is None):
+        raise UserError("give either a candidate (jax, torch, numpy, a module or a .py file) or --process COMMAND")
+    if command is None:
+        assert name is not None
+        yield load_candidate(name, dtype, device)
+        return
+    adapter = ProcessAdapter(command, dtype, timeout)
+    try:
+        yield adapter
+    finally:
+        adapter.close()
+
+
+def remarks(adapter: object) -> list[str]:
+    """What somebody else's adapter says of itself, and names that are nearly those of the interface."""
+    if not isinstance(adapter, ModuleAdapter | ProcessAdapter):
+        return []
+    edition = adapter.edition()
+    about = f"{adapter.name} {adapter.version}".strip() + (f" claims the edition {edition}" if edition else "")
+    return [about, *(f"{name} is not a function of the interface; is {close} meant?" for name, close in _near_misses(adapter.names))]
+
+
+def _near_misses(names: Iterable[str]) -> Iterator[tuple[str, str]]:
+    names = set(names)
+    for name in sorted(names - set(INTERFACE)):
+        for close in difflib.get_close_matches(name, set(INTERFACE) - names, n=1, cutoff=0.85):
+            yield name, close

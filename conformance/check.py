@@ -56,6 +56,10 @@ class Deviation(AssertionError):
     """The candidate and the reference disagree."""
 
 
+class CandidateLost(BaseException):
+    """The candidate is gone in the middle of a check. Not an Exception: hypothesis would go on to search for a smaller case."""
+
+
 @dataclasses.dataclass
 class Worst:
     """The worst comparison of a check: deviation as a share of its bound, the deviation itself, and where."""
@@ -177,7 +181,7 @@ class Run:
         expected = np.asarray(expected, np.float64)
         if actual.shape != expected.shape:
             self.worst = Worst(math.inf, math.inf, where)
-            raise Deviation(f"{where}: expected shape {expected.shape}, got {actual.shape}")
+            raise Deviation(f"{where}: {_shapes(expected.shape, actual.shape)}")
         self.compared += expected.size
         if not expected.size:
             return
@@ -190,6 +194,14 @@ class Run:
             self.worst = Worst(share, largest, place)
         if share > 1:
             raise Deviation(f"{place}: got {actual[index]!r}, expected {expected[index]!r}, off by {largest:.3g}, allowed {bound:.3g}")
+
+
+def _shapes(expected: tuple[int, ...], actual: tuple[int, ...]) -> str:
+    """What is wrong with a shape, and the usual reason."""
+    message = f"expected shape {expected}, got {actual}"
+    if actual == (*expected[1::-1], *expected[2:]) and len(expected) > 1:
+        return message + ": rows come first and time comes second"
+    return message + (": leave out the last axis" if actual == (*expected, 1) else "")
 
 
 def _brief(value: Any) -> str:

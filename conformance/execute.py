@@ -4,7 +4,7 @@ import dataclasses
 import traceback
 from collections.abc import Iterable
 
-from conformance.check import CHECKS, Check, Deviation, Run, Worst
+from conformance.check import CHECKS, CandidateLost, Check, Deviation, Run, Worst
 from conformance.requirements import requirements
 
 
@@ -53,6 +53,8 @@ def run_check(check: Check, adapter: object, dtype: str, profile: str, seed: int
         check.body(run)
     except Deviation as deviation:
         return Result(check, "fail", run.worst, run.compared, str(deviation))
+    except CandidateLost as lost:
+        return Result(check, "error", Worst(float("inf"), float("inf"), check.name), run.compared, str(lost))
     except Exception:
         return Result(check, "error", Worst(float("inf"), float("inf"), check.name), run.compared, traceback.format_exc(limit=-4))
     if not run.compared:

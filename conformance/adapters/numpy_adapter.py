@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from conformance.adapters.without_noise import WithoutNoise
 from reference_numpy import (
     agent,
     behavior,
@@ -26,7 +27,7 @@ ROWS = (transforms, distributions, layers, rssm, networks, world_model, returns,
 DIFFERENCE_STEP = 1e-5
 
 
-class NumpyAdapter:
+class NumpyAdapter(WithoutNoise):
     """Offers every public function of reference_numpy under its name, looked up at each call so that a mutant takes effect."""
 
     def __getattr__(self, name: str) -> Any:

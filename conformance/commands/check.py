@@ -8,7 +8,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from conformance.candidate import load_candidate
+from conformance.candidate import candidate, remarks
 from conformance.check import DTYPES
 from conformance.errors import UserError
 from conformance.execute import Result, rows, run_check, selected_checks
@@ -20,8 +20,12 @@ STYLE = {"pass": "green", "fail": "bold red", "error": "bold red", "not offered"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "candidate", help="jax, torch or numpy; or an adapter of your own with functions of conformance/adapter.py: a module or a .py file"
+        "candidate",
+        nargs="?",
+        help="jax, torch or numpy; or an adapter of your own with functions of conformance/adapter.py: a module or a .py file",
     )
+    parser.add_argument("--process", metavar="COMMAND", help="a command that starts a candidate of its own, see docs/adapters.md")
+    parser.add_argument("--timeout", type=float, default=120.0, help="seconds that a process has for each reply")
     parser.add_argument("--dtype", choices=DTYPES, default="float64", help="precision of the backend")
     parser.add_argument("--device", default=None, help="device of the backend, as the backend names it: cpu, cuda, gpu, ...")
     parser.add_argument("--profile", choices=tuple(profiles()), default="paper", help="profile of the configurations")
@@ -32,12 +36,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(console: Console, options: argparse.Namespace) -> int:
-    adapter = load_candidate(options.candidate, options.dtype, options.device)
     checks = selected_checks(options.dtype, options.only)
     if not checks:
         raise UserError(f"no check matches --only {options.only!r}")
     results: list[Result] = []
-    with console.status("checking") as status:
+    with (
+        candidate(options.candidate, options.process, options.dtype, options.device, options.timeout) as adapter,
+        console.status("checking") as status,
+    ):
+        options.candidate = options.candidate or options.process
+        for remark in remarks(adapter):
+            console.print(remark, markup=False, highlight=False)
         for number, check in enumerate(checks, 1):
             status.update(f"{number}/{len(checks)} {check.name}")
             results.append(run_check(check, adapter, options.dtype, options.profile, options.seed, options.examples))

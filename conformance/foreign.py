@@ -1,0 +1,118 @@
+"""What strangers' functions return, brought into the form that the checks compare: only where it can mean one thing."""
+
+import inspect
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from conformance.adapter import INTERFACE, OBJECTS, RESULTS, Adapter
+from spec import Config
+
+MAPPINGS = frozenset(
+    name for name in INTERFACE if str(inspect.signature(getattr(Adapter, name)).return_annotation).startswith("collections.abc.Mapping")
+)
+"""Functions whose result is a mapping."""
+
+LATENTS = ("stoch", "logits", "posterior", "prior")
+"""Where latents stand in a result: under these keys, or as the whole result of functions with these names."""
+HOLD_LATENTS = (
+    *("observe", "observe_given", "imagine", "imagine_given", "policy_step"),
+    *("losses", "losses_given", "train_step", "train_step_with", "train_step_given"),
+)
+
+
+class ForeignAdapter:
+    """An adapter that somebody else wrote. Subclasses say what is offered and how it is called, and give results of `to_numpy`."""
+
+    def offers(self, name: str) -> bool:
+        raise NotImplementedError
+
+    def call(self, name: str, arguments: tuple[Any, ...]) -> Any:
+        raise NotImplementedError
+
+    def edition(self) -> str | None:
+        """The edition that the implementation claims."""
+        raise NotImplementedError
+
+    def __getattr__(self, name: str) -> Any:
+        if name not in INTERFACE or not self.offers(name):
+            raise AttributeError(name)
+
+        def function(*arguments: Any) -> Any:
+            result = self.call(name, arguments)
+            return result if name in OBJECTS else arranged(name, arguments, result)
+
+        return function
+
+
+def arranged(name: str, arguments: Sequence[Any], result: Any) -> Any:
+    """The result of a function of the interface as its checks expect it.
+
+    Several results may come as a tuple or by their names (RESULTS). Latents may be flat [..., S * C], samples may be class indices.
+
+    Raises:
+      TypeError: it is of another kind: a mapping for an array, a tuple of other length, other names.
+    """
+    if name in RESULTS:
+        result = _in_order(name, RESULTS[name], result)
+    elif name in MAPPINGS:
+        if not isinstance(result, Mapping):
+            raise TypeError(f"{name}: expected a dict of arrays, got {_kind(result)}")
+    elif isinstance(result, Mapping):
+        raise TypeError(f"{name}: expected one array, got {_kind(result)}: return the entry that is meant")
+    elif isinstance(result, tuple):
+        result = np.asarray(result)
+
+    config = next((argument for argument in arguments if isinstance(argument, Config)), None)
+    if name == "categorical_sample":
+        return _onehot(result, np.shape(arguments[0]))
+    if name == "draw_categorical":
+        return _onehot(result, (len(result), *np.shape(arguments[0])))
+    if config is not None and name in LATENTS:
+        return _latents(result, config)
+    if config is not None and name in HOLD_LATENTS:
+        return tuple(_hold_latents(part, config) for part in result) if isinstance(result, tuple) else _hold_latents(result, config)
+    return result
+
+
+def _in_order(name: str, names: tuple[str, ...], result: Any) -> tuple[Any, ...]:
+    if isinstance(result, Mapping) and set(result) == set(names):
+        return tuple(result[key] for key in names)
+    if isinstance(result, tuple) and len(result) == len(names):
+        return result
+    raise TypeError(f"{name}: expected a tuple ({', '.join(names)}) or a dict with these keys, got {_kind(result)}")
+
+
+def _hold_latents(result: Any, config: Config) -> Any:
+    if not isinstance(result, Mapping):
+        return result
+    return {key: _latents(value, config) if key in LATENTS else value for key, value in result.items()}
+
+
+def _latents(value: Any, config: Config) -> np.ndarray:
+    """[..., S, C] from itself, from one flat axis, or from class indices [..., S]."""
+    array, sizes = np.asarray(value), (config.stoch, config.classes)
+    if array.shape[-2:] == sizes:
+        return array
+    if array.shape[-1:] == (config.stoch * config.classes,):
+        return array.reshape(*array.shape[:-1], *sizes)
+    return _onehot(array, (*array.shape, config.classes))
+
+
+def _onehot(value: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """One-hots of the given shape from themselves, or from whole numbers without the last axis."""
+    array = np.asarray(value)
+    if array.dtype.kind not in "iu" or array.shape != shape[:-1]:
+        return array
+    if array.size and not 0 <= array.min() <= array.max() < shape[-1]:
+        raise TypeError(f"expected class indices in 0 .. {shape[-1] - 1}, got {array.min()} .. {array.max()}")
+    return np.asarray(array[..., None] == np.arange(shape[-1]), np.float64)
+
+
+def _kind(result: Any) -> str:
+    if isinstance(result, Mapping):
+        return f"a dict with the keys {', '.join(map(repr, result))}"
+    if isinstance(result, tuple):
+        return f"a tuple of {len(result)}"
+    return f"one array of shape {list(np.shape(result))}"

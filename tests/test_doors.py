@@ -1,0 +1,340 @@
+"""The module and the state door: what strangers write is understood, and what it does wrong is found."""
+
+import dataclasses
+import inspect
+import json
+import re
+import types
+from collections import namedtuple
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import numpy as np
+import pytest
+import torch
+
+from conformance import candidate
+from conformance.adapter import INTERFACE, OBJECTS, RESULTS, Adapter, load_adapter
+from conformance.adapters.numpy_adapter import NumpyAdapter
+from conformance.adapters.torch_adapter import TorchAdapter
+from conformance.adapters.without_noise import WithoutNoise
+from conformance.candidate import ModuleAdapter, remarks
+from conformance.cli import main
+from conformance.errors import UserError
+from conformance.execute import Result, run_check, selected_checks
+from conformance.foreign import arranged
+from conformance.problems import small_config
+from conformance.serve import load_file, to_numpy
+from conformance.skeleton import HOOKS, functions_by_row, skeleton
+from spec import Config
+
+TESTS = Path(__file__).resolve().parent
+DOCUMENT = (TESTS.parent / "docs" / "adapters.md").read_text(encoding="utf-8")
+CHECKS = {check.name: check for check in selected_checks("float64")}
+CONFIG = small_config("paper")  # S = 3, C = 5
+
+
+def module(**functions: Any) -> ModuleAdapter:
+    made = types.ModuleType("mine")
+    vars(made).update(functions)
+    return ModuleAdapter(made, "float64")
+
+
+def run(name: str, adapter: object) -> Result:
+    return run_check(CHECKS[name], adapter, "float64", "paper", examples=5)
+
+
+# --- What comes back ---------------------------------------------------------------------------------------------------------------------
+
+
+def test_tensors_come_back_as_numpy() -> None:
+    half = np.array([0.5, -2.0])
+    tensor = torch.tensor(half, requires_grad=True)
+    for value in (tensor, tensor * 1, tensor.to(torch.bfloat16), tensor.float(), np.float16(half), load_jax().asarray(half, "bfloat16")):
+        array = to_numpy(value)
+        assert isinstance(array, np.ndarray)
+        np.testing.assert_array_equal(array, half)
+    assert to_numpy(torch.tensor([True, False])).dtype == bool
+    assert to_numpy(torch.tensor([3])).dtype == np.int64
+
+
+def load_jax() -> Any:
+    import jax.numpy as jnp
+
+    return jnp
+
+
+@dataclasses.dataclass
+class Losses:
+    representation: Any
+    dynamics: Any
+
+
+Normal = namedtuple("Normal", ["std", "mean"])
+
+
+class Items:
+    """Like a TensorDict: a mapping that is none."""
+
+    def items(self) -> Any:
+        return {"dynamics": 1.0, "representation": 2.0}.items()
+
+
+def test_several_results_come_in_any_dress() -> None:
+    losses = (np.zeros(2), np.zeros(2), CONFIG)
+    for result in ((1.0, 2.0), [1.0, 2.0], {"representation": 2.0, "dynamics": 1.0}, Losses(2.0, 1.0), Items()):
+        assert arranged("kl_losses", losses, to_numpy(result)) == (1.0, 2.0)
+    assert arranged("bounded_normal", (), to_numpy(Normal(2.0, 1.0))) == (1.0, 2.0)
+    for result, got in (
+        ((1.0,), "a tuple of 1"),
+        ({"dyn": 1, "rep": 2}, "a dict with the keys 'dyn', 'rep'"),
+        (np.ones(2), "one array of shape \\[2\\]"),
+    ):
+        with pytest.raises(
+            TypeError, match=rf"kl_losses: expected a tuple \(dynamics, representation\) or a dict with these keys, got {got}"
+        ):
+            arranged("kl_losses", losses, to_numpy(result))
+    with pytest.raises(TypeError, match="symlog: expected one array, got a dict with the keys 'x'"):
+        arranged("symlog", (np.ones(2),), {"x": np.ones(2)})
+    with pytest.raises(TypeError, match="observe: expected a dict of arrays, got a tuple of 3"):
+        arranged("observe", (CONFIG,), (1, 2, 3))
+
+
+def test_latents_come_flat_or_as_indices() -> None:
+    indices = np.array([[0, 4, 2], [1, 1, 3]])
+    onehot = np.eye(5)[indices]
+    for latents in (onehot, onehot.reshape(2, 15), indices, indices.astype(np.int32)):
+        np.testing.assert_array_equal(arranged("posterior", (CONFIG,), latents), onehot)
+        np.testing.assert_array_equal(arranged("observe", (CONFIG,), {"stoch": latents, "deter": indices})["stoch"], onehot)
+        np.testing.assert_array_equal(arranged("policy_step", (CONFIG,), ({"stoch": latents}, indices))[0]["stoch"], onehot)
+    assert arranged("observe", (CONFIG,), {"deter": indices})["deter"] is indices
+    np.testing.assert_array_equal(arranged("categorical_sample", (np.zeros((2, 3, 5)), None), indices), onehot)
+    np.testing.assert_array_equal(arranged("draw_categorical", (np.zeros((3, 5)), 0.0, 0, 2), indices), onehot)
+    for wrong in (indices - 1, indices + 1):
+        with pytest.raises(TypeError, match=r"class indices in 0 .. 4, got"):
+            arranged("posterior", (CONFIG,), wrong)
+    real = indices.astype(float)  # whole numbers only: reals could be logits of another shape
+    assert arranged("posterior", (CONFIG,), real) is real
+
+
+def test_every_tuple_has_names() -> None:
+    annotated = {name for name in INTERFACE if str(inspect.signature(getattr(Adapter, name)).return_annotation).startswith("tuple")}
+    assert annotated == set(RESULTS)
+    assert set(OBJECTS) < set(INTERFACE)
+
+
+def lambda_return(reward: Any, continue_: Any, value: Any, discount: float, lambda_: float) -> Any:
+    return load_adapter("numpy").lambda_return(reward, continue_, value, discount, lambda_)  # type: ignore[attr-defined]
+
+
+def test_shapes_are_explained() -> None:
+    """Expected, got, and the usual reason."""
+    swapped = run("returns.lambda_return_literals", module(lambda_return=lambda *arguments: lambda_return(*arguments).T))
+    assert swapped.message == "lambda_return: expected shape (1, 3), got (3, 1): rows come first and time comes second"
+    longer = run("returns.lambda_return_literals", module(lambda_return=lambda *arguments: lambda_return(*arguments)[..., None]))
+    assert longer.message == "lambda_return: expected shape (1, 3), got (1, 3, 1): leave out the last axis"
+    shorter = run("returns.lambda_return_literals", module(lambda_return=lambda *arguments: lambda_return(*arguments)[:, 1:]))
+    assert shorter.message == "lambda_return: expected shape (1, 3), got (1, 2)"
+
+
+@pytest.mark.parametrize(
+    ("function", "message"),
+    [
+        (
+            lambda reward, value: reward,
+            "lambda_return is called with (reward, continue_, value, discount, lambda_), in this order; yours takes",
+        ),
+        (lambda *arguments: None, "lambda_return: expected numbers, got None: is a `return` missing?"),
+        (lambda *arguments: "done", "lambda_return: expected numbers, got str"),
+        (lambda *arguments: {"returns": 1.0}, "lambda_return: expected one array, got a dict with the keys 'returns'"),
+    ],
+)
+def test_mistakes_in_an_adapter_are_explained(function: Any, message: str) -> None:
+    result = run("returns.lambda_return_literals", module(lambda_return=function))
+    assert result.status == "error"
+    assert message in result.message
+
+
+def test_convert_is_applied_to_every_array() -> None:
+    kinds = []
+
+    def core(params: Any, deter: Any, stoch: Any, action: Any, config: Any) -> Any:
+        kinds.extend(type(x) for x in (*params.values(), deter, stoch, action, config))
+        return deter
+
+    run("rssm.gates_literals", module(core=core, convert=torch.as_tensor))
+    assert set(kinds) == {torch.Tensor, Config}
+
+
+def test_setup_and_what_an_adapter_says_of_itself() -> None:
+    seen = []
+    mine = types.ModuleType("mine")
+    exec("def lambda_returns(x): ...\ndef symlog_(x): ...\ndef my_helper(x): ...\ndef _symexp(x): ...", vars(mine))
+    mine.__version__, mine.setup, mine.edition = "2", seen.append, lambda: "official"  # type: ignore[attr-defined]
+    adapter = ModuleAdapter(mine, "float32")
+    assert seen == ["float32"]
+    assert remarks(adapter) == [
+        "mine 2 claims the edition official",
+        "lambda_returns is not a function of the interface; is lambda_return meant?",
+        "symlog_ is not a function of the interface; is symlog meant?",
+    ]
+    assert remarks(load_adapter("numpy")) == []
+
+
+def test_an_adapter_that_is_not_there(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"conformance new-adapter .*mine\.py"):
+        candidate.load_candidate(str(tmp_path / "mine.py"), "float64")
+
+
+# --- A stranger --------------------------------------------------------------------------------------------------------------------------
+
+STRANGER = TESTS / "stranger_adapter.py"
+PASSES = (
+    *("returns.lambda_return_literals", "returns.lambda_return_matches", "returns.lambda_return_ignores_the_start"),
+    *("transforms.twohot_literals", "world_model.kl_matches", "sampling.latents_have_their_frequencies"),
+    *("rssm.gates_literals", "rssm.gates_are_split_inside_each_block", "rssm.core_matches"),
+)
+
+
+@pytest.mark.parametrize("name", PASSES)
+def test_the_stranger_passes(name: str) -> None:
+    """A code base that is time first, flat, and has layouts of its own, through an adapter of at most 60 lines."""
+    assert len(STRANGER.read_text(encoding="utf-8").splitlines()) <= 60
+    result = run(name, ModuleAdapter(load_file(STRANGER), "float64"))
+    assert result.status == "pass", result.message
+
+
+def test_a_mistake_of_the_stranger_is_found() -> None:
+    """Its λ-return with the value of the state that is left: the paper's printed indices."""
+    stranger = load_file(STRANGER)
+    right = stranger.code.lambda_values
+    late = types.SimpleNamespace(lambda_values=lambda rewards, values, *rest: right(rewards, values.roll(1, 0), *rest))
+    stranger.code = late
+    assert run("returns.lambda_return_matches", ModuleAdapter(stranger, "float64")).status == "fail"
+
+
+# --- The skeleton and the document -------------------------------------------------------------------------------------------------------
+
+
+def test_the_skeleton_offers_nothing_and_uncommented_everything() -> None:
+    source = skeleton("mine.py")
+    empty: dict[str, Any] = {}
+    exec(source, empty)
+    assert not [name for name in empty if name in INTERFACE]
+    full: dict[str, Any] = {}
+    exec(re.sub(r"^#(?! ---) ?", "", source, flags=re.MULTILINE), full)
+    assert {name for name in full if callable(full[name])} == {*INTERFACE, *HOOKS}
+    for name, arguments in INTERFACE.items():
+        assert tuple(inspect.signature(full[name]).parameters) == arguments
+        assert len(str(full[name].__doc__)) > 20, name
+        assert not re.search(r"\[[A-Z]{2,5}-\d+\]|Implements", full[name].__doc__), name
+
+
+def test_the_skeleton_is_grouped_by_chapter() -> None:
+    rows = functions_by_row()
+    assert [name for functions in rows.values() for name in functions] == list(INTERFACE)
+    assert rows["returns"][0] == "lambda_return"
+    assert rows["rssm"][-2:] == ["observe_given", "imagine_given"]
+    assert {"gradients", "train_step_given", "draw_parameters"} < set(rows["agent"])
+    assert rows["training_loop"][-1] == "derive_seed"
+    assert "# --- returns: spec/07-returns.md ---" in skeleton("mine.py")
+
+
+def test_new_adapter(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["new-adapter"]) == 0
+    assert main(["new-adapter"]) == 2
+    assert "my_adapter.py exists; give another name" in capsys.readouterr().err
+    assert main(["new-adapter", "absent/mine.py"]) == 2
+    assert "cannot write absent/mine.py" in capsys.readouterr().err
+    assert (tmp_path / "my_adapter.py").read_text(encoding="utf-8") == skeleton("my_adapter.py")
+    assert main(["check", "my_adapter.py", "--only", "symlog"]) == 1  # nothing passes, as nothing is offered
+    assert "not offered" in capsys.readouterr().out
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", DOCUMENT, re.DOTALL)
+
+
+def test_the_examples_of_the_document_pass() -> None:
+    example, given, draw = blocks("python")
+    mine = types.ModuleType("example")
+    exec(example, vars(mine))
+    adapter = ModuleAdapter(mine, "float64")
+    for name in ("transforms.symlog_matches", "returns.lambda_return_matches", "layers.rms_norm_matches"):
+        assert run(name, adapter).status == "pass", name
+    drawing = types.ModuleType("drawing")
+    exec(draw, vars(drawing))
+    assert run("sampling.normals_have_their_distribution", ModuleAdapter(drawing, "float64")).status == "pass"
+    scope: dict[str, Any] = {}
+    exec(given, scope)
+    probs = torch.tensor([0.25, 0.75], requires_grad=True)
+    sample = scope["Given"](probs, torch.tensor([1.0, 0.0])).rsample()
+    sample[0].backward()
+    assert sample.tolist() == [1, 0]
+    assert probs.grad is not None
+    assert probs.grad.tolist() == [1, 0]
+
+
+def test_the_messages_of_the_document_are_valid() -> None:
+    schema = json.loads((TESTS.parent / "conformance" / "protocol.schema.json").read_text(encoding="utf-8"))
+    jsonschema.Draft202012Validator.check_schema(schema)
+    lines = [json.loads(line) for line in blocks("json")[0].splitlines()]
+    kinds = ("request", "start_reply", "request", "run_reply", "request", "error_reply")
+    for kind, message in zip(kinds, lines, strict=True):
+        jsonschema.Draft202012Validator({"$ref": f"#/$defs/{kind}", "$defs": schema["$defs"]}).validate(message)
+
+
+# --- Given samples -----------------------------------------------------------------------------------------------------------------------
+
+
+class Given(WithoutNoise, TorchAdapter):
+    """The PyTorch backend with given samples."""
+
+    def gradients_given(self, params: Any, slow_critic: Any, return_range: Any, batch: Any, samples: Any, *rest: Any) -> Any:
+        return self.gradients(params, slow_critic, return_range, batch, self.noise_of(params, batch, samples, *rest), *rest)
+
+    def train_step_given(self, state: Any, batch: Any, samples: Any, *rest: Any) -> Any:
+        return self.train_step(state, batch, self.noise_of(state["params"], batch, samples, *rest), *rest)
+
+
+class Forgetful(NumpyAdapter):
+    """Never resets."""
+
+    def observe_given(self, params: Any, carry: Any, tokens: Any, prev_action: Any, is_first: Any, *rest: Any) -> Any:
+        return super().observe_given(params, carry, tokens, prev_action, np.zeros_like(is_first), *rest)
+
+
+class Ignorant(NumpyAdapter):
+    """Imagines with other latents than those given."""
+
+    def imagine_given(self, params: Any, carry: Any, action: Any, stoch: Any, config: Any) -> Any:
+        return super().imagine_given(params, carry, action, np.roll(stoch, 1, -1), config)
+
+
+class Early(NumpyAdapter):
+    """Gives the prior logits of the state before."""
+
+    def observe_given(self, *arguments: Any) -> Any:
+        result = super().observe_given(*arguments)
+        return result | {"prior": np.roll(result["prior"], 1, 1)}
+
+
+@pytest.mark.parametrize("name", [name for name in CHECKS if name.startswith("given.")])
+def test_an_implementation_with_given_samples_passes(name: str) -> None:
+    result = run(name, Given("float64", "cpu"))
+    assert result.status == "pass", result.message
+
+
+@pytest.mark.parametrize(
+    ("mistaken", "name"),
+    [
+        (Forgetful, "observe_given_matches"),
+        (Early, "observe_given_matches"),
+        (Ignorant, "imagine_given_matches"),
+        (Ignorant, "losses_given_match"),
+    ],
+)
+def test_mistakes_with_given_samples_are_found(mistaken: type[NumpyAdapter], name: str) -> None:
+    assert run(f"given.{name}", mistaken()).status == "fail"

@@ -1,0 +1,354 @@
+"""The process door: whatever the other side does, there is a result, and it says what happened."""
+
+import ast
+import contextlib
+import json
+import math
+import shlex
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import numpy as np
+import pytest
+
+from conformance import process
+from conformance.adapter import OBJECTS
+from conformance.adapters.numpy_adapter import NumpyAdapter
+from conformance.check import CandidateLost
+from conformance.cli import main
+from conformance.errors import UserError
+from conformance.execute import Result, missing, run_check, selected_checks
+from conformance.problems import small_config, spaces
+from conformance.process import RESTARTS, CandidateError, ProcessAdapter, encode_argument
+from conformance.serve import BadMessage, decode, encode, to_numpy
+
+FAKE = Path(__file__).resolve().parent / "fake_process.py"
+ROOT = FAKE.parent.parent
+CHECKS = {check.name: check for check in selected_checks("float64")}
+
+
+def command(mode: str = "") -> str:
+    return shlex.join([sys.executable, str(FAKE), mode])
+
+
+@contextlib.contextmanager
+def fake(mode: str = "", timeout: float = 60.0) -> Iterator[ProcessAdapter]:
+    adapter = ProcessAdapter(command(mode), "float64", timeout)
+    adapter._timeout = 0.5 if "hang" in mode else timeout
+    try:
+        yield adapter
+    finally:
+        adapter.close()
+
+
+def result_of(adapter: object) -> Result:
+    return run_check(CHECKS["transforms.symlog_matches"], adapter, "float64", "paper", examples=2)
+
+
+def test_a_right_implementation_passes() -> None:
+    """Every request and every reply of this is valid: the fake holds them against the schema."""
+    with fake() as adapter:
+        assert (adapter.name, adapter.version, adapter.edition()) == ("fake", "0.1", "official")
+        assert not hasattr(adapter, "symexp")
+        assert not hasattr(adapter, "an_extra")
+        assert result_of(adapter).status == "pass"
+        running = adapter._connection
+        assert running is not None
+    assert running.process.wait(5) == 0
+
+
+def test_what_is_sent_comes_back() -> None:
+    """NaN, infinities, the sign of zero, every dtype and an empty array survive the way there and back."""
+    numbers = np.array([[math.nan, math.inf, -math.inf], [-0.0, 5e-324, 1 / 3]])
+    with fake() as adapter:
+        for sent in (
+            numbers,
+            numbers.astype(np.float32),
+            np.zeros((0, 3)),
+            np.arange(3),
+            np.arange(3, dtype=np.uint8),
+            numbers > 0,
+            numbers.T,
+        ):
+            came, single = adapter.kl_losses(sent, math.inf)
+            assert came.dtype == sent.dtype
+            assert came.shape == sent.shape
+            assert came.tobytes() == sent.tobytes()
+            assert single == math.inf
+        deep = {"a": {"b": np.ones(2)}, "c": (1, 2.5, True)}
+        came, several = adapter.kl_losses(deep, [np.ones(1), {"d": 0.5}])
+        np.testing.assert_array_equal(came["a"]["b"], np.ones(2))
+        assert came["c"] == (1, 2.5, True)
+        assert several[1] == {"d": 0.5}
+
+
+def test_the_format_of_an_array() -> None:
+    expected = {"dtype": "float32", "shape": [2], "data": "AACAPwAAAMA="}  # 1.0 is 00 00 80 3f, -2.0 is 00 00 00 c0
+    assert encode(np.array([1.0, -2.0], np.float32)) == expected
+    assert encode(np.array([1.0, -2.0], ">f4")) == expected
+    np.testing.assert_array_equal(decode(expected), np.array([1.0, -2.0]))
+    assert encode(math.nan)["shape"] == encode(np.float64(0.5))["shape"] == []
+    assert encode(0.5) == 0.5
+
+
+def test_configurations_and_spaces() -> None:
+    """They are plain JSON, with what is derived from them, and become namespaces."""
+    config, task = small_config("paper"), spaces("both", "mixed")
+    got = decode(json.loads(json.dumps(encode_argument(config))))
+    assert (got.units, got.imagined_discount, got.feature_size) == (config.units, config.imagined_discount, config.feature_size)
+    assert got.cnn_multipliers == config.cnn_multipliers
+    got = decode(json.loads(json.dumps(encode_argument(task))))
+    assert list(got.observations) == list(task.observations)
+    assert got.actions["buttons"].classes == (2, 3)
+    assert got.images["image"].array_shape == (16, 32, 3)
+    assert (got.action_size, got.action_noise_size) == (7, 4)
+
+
+BROKEN = {
+    "crash": ("ended with exit code 3", "Segmentation of reality"),
+    "hang": ("no reply within 0.5 s",),
+    "half line": ("ended with exit code 0 in the middle of a line",),
+    "half line and hang": ("no reply within 0.5 s", "bytes of an unfinished line"),
+    "close": ("closed its standard output",),
+    "endless babble": ("more than 100 lines on standard output are no messages, the last: 'nothing'",),
+    "wrong id": ("answered request 7777 where 2 was asked",),
+    "neither": ("either a result or an error", "answer"),
+    "error without a message": ("either a result or an error",),
+    "huge line": ("a line is longer than 1,000,000 bytes",),
+}
+
+
+@pytest.mark.parametrize("mode", BROKEN)
+def test_a_lost_process_is_a_result(mode: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It says at which function and why, and the process is gone."""
+    monkeypatch.setattr(process, "MESSAGE_BYTES", 1_000_000)
+    with fake(mode) as adapter:
+        connection = adapter._connection
+        assert connection is not None
+        result = result_of(adapter)
+        assert result.status == "error"
+        assert result.message.startswith("the process was lost at run symlog: ")
+        for words in BROKEN[mode]:
+            assert words in result.message
+        assert connection.process.poll() is not None
+        assert adapter._starts == 1, "hypothesis went on to search for a smaller case"
+
+
+@pytest.mark.parametrize(
+    ("mode", "message"),
+    [
+        ("too few bytes", "bytes, got"),
+        ("unknown dtype", "expected one of the dtypes bool, "),
+        ("text", "expected numbers, got str"),
+        ("null", "expected numbers, got None"),
+    ],
+)
+def test_a_result_that_cannot_be_read(mode: str, message: str) -> None:
+    """The process goes on: only this call has no result."""
+    with fake(mode) as adapter:
+        connection = adapter._connection
+        with pytest.raises(CandidateError, match=f"^symlog: .*{message}"):
+            adapter.symlog(np.ones(2))
+        assert adapter._connection is connection
+
+
+@pytest.mark.parametrize(("mode", "raised"), [("ValueError", ValueError), ("KeyError", KeyError), ("TypeError", CandidateError)])
+def test_errors_of_the_other_side(mode: str, raised: type[Exception]) -> None:
+    with fake(mode) as adapter, pytest.raises(raised, match="fake refuses x"):
+        adapter.symlog(np.ones(2))
+
+
+def test_babble_is_shown_and_left_out(capfd: pytest.CaptureFixture[str]) -> None:
+    with fake("babble") as adapter:
+        assert adapter.symlog(np.zeros(2)).tolist() == [0, 0]
+    shown = capfd.readouterr().err
+    assert "loading weights..." in shown
+    assert ": 42\n" in shown
+    assert '{"level": "info"}' in shown
+
+
+def test_the_next_check_gets_a_new_process_a_few_times() -> None:
+    with fake("crash") as adapter:
+        for _ in range(RESTARTS + 1):
+            assert "exit code 3" in result_of(adapter).message
+        message = result_of(adapter).message
+        assert message == "the process is not started again: it was lost 6 times"
+
+
+def test_a_process_that_does_not_read_is_no_hang() -> None:
+    """A message larger than any pipe is written to it, and the time runs out."""
+    with fake("stops reading") as adapter:
+        assert adapter.symlog(np.zeros(2)).tolist() == [0, 0]
+        adapter._timeout = 0.5
+        before = time.monotonic()
+        with pytest.raises(CandidateLost, match="no reply within"):
+            adapter.symlog(np.zeros(1_000_000))
+        assert time.monotonic() - before < 30
+
+
+def test_a_process_that_does_not_stop_is_ended() -> None:
+    with fake("does not stop") as adapter:
+        running = adapter._connection
+        assert running is not None
+    assert running.process.poll() == -9
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        (command("dies at once"), "ended with exit code 1 | its standard error ended with: | no such licence"),
+        (command("old protocol"), "it speaks protocol 0, and the kit 1"),
+        (command("reads nothing"), "no reply within 0.5 s"),
+        ("no-such-program --now", "cannot run 'no-such-program --now'"),
+        ("", "cannot run ''"),
+        ("python 'unfinished", "No closing quotation"),
+    ],
+)
+def test_a_process_that_does_not_start(line: str, message: str) -> None:
+    with pytest.raises(UserError) as raised:
+        ProcessAdapter(line, "float64", 0.5 if "reads nothing" in line else 60.0)
+    assert message in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+def test_the_command_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check", "--process", command(), "--only", "symlog_matches"]) == 0
+    assert "fake 0.1 claims the edition official" in capsys.readouterr().out
+    assert main(["check", "--process", command("crash"), "--only", "symlog_matches"]) == 1
+    assert main(["check", "--process", command("dies at once")]) == 2
+    assert main(["check", "numpy", "--process", command()]) == 2
+    assert main(["check"]) == 2
+    assert "give either a candidate" in capsys.readouterr().err
+
+
+ADAPTER = """
+import numpy as np
+print("hello from the import")
+__version__ = "1.5"
+
+
+def setup(dtype):
+    assert dtype == "float64"
+
+
+def edition():
+    return "paper"
+
+
+def symlog(x):
+    print("a print in the middle")
+    return np.sign(x) * np.log1p(np.abs(x))
+
+
+def lambda_return(reward, continue_, value, discount, lambda_):
+    raise ValueError("reward: not like this")
+
+
+def exponential_bins(bins):
+    return [][bins]
+
+
+def kl_losses(posterior_logits, prior_logits, config):
+    return {"dynamics": config.free_nats + np.zeros(2), "representation": np.full(2, config.imagined_discount)}
+"""
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[ProcessAdapter]:
+    """The server as it is used where this project is not: one copied file, no packages of ours on the path."""
+    shutil.copy(ROOT / "conformance" / "serve.py", tmp_path / "serve.py")
+    (tmp_path / "mine.py").write_text(ADAPTER, encoding="utf-8")
+    adapter = ProcessAdapter(shlex.join([sys.executable, "-I", str(tmp_path / "serve.py"), str(tmp_path / "mine.py")]), "float64", 60.0)
+    yield adapter
+    adapter.close()
+
+
+def test_the_server_alone(server: ProcessAdapter) -> None:
+    assert (server.name, server.version, server.edition()) == ("mine", "1.5", "paper")
+    assert result_of(server).status == "pass"
+    config = small_config("paper")
+    dynamics, representation = server.kl_losses(np.zeros(2), np.zeros(2), config)
+    assert dynamics.tolist() == [2.0, 2.0]
+    assert representation[0] == config.imagined_discount
+    with pytest.raises(ValueError, match=r"^reward: not like this$"):
+        server.lambda_return(np.zeros((1, 2)), np.zeros((1, 2)), np.zeros((1, 2)), 0.9, 0.9)
+    with pytest.raises(CandidateError, match=r"return \[\]\[bins\](?s:.*)IndexError: list index out of range"):
+        server.exponential_bins(5)
+
+
+def test_the_server_needs_only_numpy() -> None:
+    source = ast.parse((ROOT / "conformance" / "serve.py").read_text(encoding="utf-8"), feature_version=(3, 8))
+    imported = {name.name.partition(".")[0] for node in ast.walk(source) if isinstance(node, ast.Import) for name in node.names}
+    imported |= {str(node.module).partition(".")[0] for node in ast.walk(source) if isinstance(node, ast.ImportFrom)}
+    assert imported - set(sys.stdlib_module_names) == {"numpy"}
+    assert "pickle" not in imported
+    code = "import sys, conformance.serve; print({'hypothesis', 'rich', 'spec', 'conformance.check'} & set(sys.modules))"
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True).stdout == "set()\n"
+
+
+def test_the_server_as_a_module(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text("import numpy as np\nfrom neighbour import symlog\n", encoding="utf-8")
+    (tmp_path / "neighbour.py").write_text("import numpy as np\n\n\ndef symlog(x):\n    return np.arcsinh(x)\n", encoding="utf-8")
+    line = shlex.join([sys.executable, "-m", "conformance.serve", str(tmp_path / "mine.py")])
+    adapter = ProcessAdapter(line, "float64", 60.0)
+    assert result_of(adapter).status == "fail"
+    adapter.close()
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        {"dtype": "object", "shape": [1], "data": ""},
+        {"dtype": "float64", "shape": [-1], "data": ""},
+        {"dtype": "float64", "shape": [True], "data": "AAAAAAAA8D8="},
+        {"dtype": "float64", "shape": 3, "data": ""},
+        {"dtype": "float64", "shape": [1], "data": "no base64!"},
+        {"dtype": "float64", "shape": [1], "data": 5},
+        {"map": {}, "more": 1},
+        {"pickle": "gASVBQAAAA=="},
+        {"map": 3},
+    ],
+)
+def test_bad_values_are_refused(message: dict[str, Any]) -> None:
+    with pytest.raises(BadMessage):
+        decode(message)
+
+
+def test_other_dtypes_are_converted() -> None:
+    assert to_numpy(np.float16([0.5])).dtype == np.float64
+    assert to_numpy(np.array([3], np.uint16)).dtype == np.int64
+    for wrong in (None, "text", np.array(["text"]), np.array([1j]), [1.0, None], object()):
+        with pytest.raises(TypeError, match="expected numbers"):
+            to_numpy(wrong)
+
+
+@pytest.mark.slow
+def test_every_check_works_through_a_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The reference behind the door passes all checks but those of objects with methods, and every request of these is valid."""
+    schema = json.loads((ROOT / "conformance" / "protocol.schema.json").read_text(encoding="utf-8"))
+    validator = jsonschema.Draft202012Validator({"$ref": "#/$defs/request", "$defs": schema["$defs"]})
+    send, requests = process.Connection.send, 0
+
+    def validated(connection: process.Connection, message: Any) -> None:
+        nonlocal requests
+        requests += 1
+        validator.validate(message)
+        send(connection, message)
+
+    monkeypatch.setattr(process.Connection, "send", validated)
+    adapter = ProcessAdapter(
+        shlex.join([sys.executable, "-m", "conformance.serve", str(FAKE.parent / "reference_adapter.py")]), "float64", 60.0
+    )
+    results = [run_check(check, adapter, "float64", "paper", examples=1) for check in CHECKS.values()]
+    adapter.close()
+    assert [result.message for result in results if result.status in ("fail", "error")] == []
+    reference = NumpyAdapter()
+    asked = {check.name for check in CHECKS.values() if not missing(reference, check) and not set(check.uses) & set(OBJECTS)}
+    assert {result.check.name for result in results if result.status == "pass"} == asked
+    assert requests > len(asked)
