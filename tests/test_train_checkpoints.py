@@ -3,6 +3,8 @@
 import dataclasses
 import json
 import os
+import random
+import shutil
 import signal
 import subprocess
 from contextlib import ExitStack
@@ -14,7 +16,7 @@ from train_fakes import EPISODE, FakeLearner
 from train_runs import Make, batches, run_quietly, stored
 
 from reference_numpy.training_loop import derive_seed
-from train import checkpoint, loop, setup
+from train import checkpoint, files, loop, setup
 from train.errors import UserError
 from train.logger import read_metrics
 from train.resume import save
@@ -236,6 +238,53 @@ def test_a_run_whose_checkpoints_are_all_damaged_does_not_begin_anew(make: Make)
         with pytest.raises(UserError, match=r"damaged checkpoints only: .*000000000060.damaged"):
             loop.run(make(steps=90), FakeLearner)
     assert list((make().logdir / "replay").iterdir())
+
+
+def junk(rng: random.Random, depth: int = 0) -> Any:
+    kinds = [None, True, -1, 2**62, 10**400, 1e300, float("nan"), "", "x" * 3, "1/0", [], {}]
+    return (
+        rng.choice(kinds)
+        if depth > 1 or rng.random() < 0.7
+        else [junk(rng, depth + 1)]
+        if rng.random() < 0.5
+        else {"x": junk(rng, depth + 1)}
+    )
+
+
+def forge(info: Any, rng: random.Random) -> None:
+    """Replaces, removes or adds one value somewhere in a tree of JSON."""
+    node, key = {"": info}, ""
+    while isinstance(node[key], dict | list) and node[key] and rng.random() < 0.8:
+        node = node[key]
+        key = rng.choice(list(node) if isinstance(node, dict) else range(len(node)))
+    if rng.random() < 0.2 and key != "":
+        del node[key]
+    else:
+        node[key] = junk(rng)
+
+
+def test_forged_descriptions_are_refused_or_sound(make: Make, tmp_path: Path) -> None:
+    """With right checksums, as a forger would write them. Whatever a description says: an agent that trains on, or one line."""
+    options = make(task="gym:CartPole-v1", steps=40, eval_every=20, eval_episodes=1)
+    loop.run(options, FakeLearner)
+    folder = "checkpoints/000000000040"
+    description = json.loads((options.logdir / folder / "run.json").read_text())
+    rng, outcomes = random.Random(0), []
+    for number in range(120):
+        logdir = tmp_path / str(number)
+        shutil.copytree(options.logdir, logdir)
+        forged = json.loads(json.dumps(description))
+        forge(forged, rng)
+        (logdir / folder / "run.json").write_text(json.dumps(forged))
+        files.seal(logdir / folder, checkpoint.FILES)
+        try:
+            run_quietly(dataclasses.replace(options, logdir=logdir, steps=44))
+            outcomes.append("sound")
+        except UserError:
+            outcomes.append("refused")
+        shutil.rmtree(logdir)
+    assert outcomes.count("refused") > 60
+    assert outcomes.count("sound") > 10
 
 
 def test_a_checkpoint_of_another_format_is_refused(make: Make) -> None:

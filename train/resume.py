@@ -1,7 +1,7 @@
 """A run that is interrupted and continued: what a checkpoint holds, and how a run begins from one. [LOOP-21] to [LOOP-23]"""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -68,6 +68,7 @@ def find(options: Options, display: Display) -> Checkpoint | None:
         except Damaged as error:
             give_up(path, error, display)
             continue
+        _require_sound(saved)
         checkpoint.require_same_identity(saved, options.identity())
         return saved
     damaged = sorted((options.logdir / "checkpoints").glob("*.damaged"))
@@ -86,16 +87,14 @@ def give_up(path: Path, error: Exception, display: Display) -> None:
 def restore_environments(saved: Checkpoint, envs: Environments, display: Display) -> Record | None:
     """Brings fresh environments to where those of the checkpoint were: [LOOP-23]. None, and a line that says why, if that fails."""
     arrays = saved.loop
-    histories = [
-        None if entry is None else History.from_json(entry, arrays[f"actions/{worker}"])
-        for worker, entry in enumerate(saved.info["environments"])
-    ]
+    entries = enumerate(saved.info["environments"])
+    histories = [History.from_json(entry, arrays[name]) if entry and (name := f"actions/{i}") in arrays else None for i, entry in entries]
     record = envs.restore(histories)
     if record is None:
         display.say(f"the environments cannot be restored: {FROM_BOUNDARY}")
         return None
     before = _without_prefix("record/", arrays)
-    if any(record[key].tobytes() != before[key].tobytes() for key in before):
+    if before.keys() != record.keys() or any(record[key].tobytes() != before[key].tobytes() for key in before):
         display.say(f"the environments are not deterministic, the same actions led elsewhere: {FROM_BOUNDARY}")
         return None
     return record
@@ -107,19 +106,68 @@ def restore(run: Run, saved: Checkpoint, exactly: bool) -> None:
     try:
         run.learner.load_state_dict(saved.learner)
         run.replay.load_drawn(arrays)
-    except ValueError as error:
+        run.ratio.load_state_dict(info["replay_ratio"])
+        if exactly:
+            carry, scores = _without_prefix("carry/", arrays), _without_prefix("scores/", arrays)
+            _require_same_form(run.learner.save_carry(run.carry), carry)
+            _require_same_form(vars(run.scores), scores)
+            run.carry, run.scores.total, run.scores.length = run.learner.load_carry(carry), scores["total"], scores["length"]
+    except (ValueError, KeyError, ZeroDivisionError) as error:
         raise UserError(f"the checkpoint {saved.path} does not fit this version: {error}") from error
-    run.ratio.load_state_dict(info["replay_ratio"])
     run.counters = Counters(**info["counters"])
     run.random_return, run.evaluation = info["random_return"], info["evaluation"]
     run.returns.extend(info["returns"])
     run.means = Means(info["metrics"])
-    if exactly:
-        run.carry = run.learner.load_carry(_without_prefix("carry/", arrays))
-        for name, array in _without_prefix("scores/", arrays).items():
-            setattr(run.scores, name, array)
     made_by = "" if info["backend"] == run.options.backend else f", which {info['backend']} has trained so far"
     run.display.say(f"continuing at step {run.step:,} from {saved.path}{made_by}")
+
+
+def _require_sound(saved: Checkpoint) -> None:
+    """Whoever forges a description forges its checksum too: what is of another type must be an error, not a traceback.
+
+    Raises:
+      UserError: the names of what is missing or of another type.
+    """
+    info = saved.info
+    sound = {
+        "identity": isinstance(info.get("identity"), dict),
+        "spaces": _is_of(info.get("spaces"), lambda entries: isinstance(entries, dict)),
+        "backend": isinstance(info.get("backend"), str),
+        "counters": _is_of(info.get("counters"), _is_count) and info["counters"].keys() == dataclasses.asdict(Counters()).keys(),
+        "environments": isinstance(info.get("environments"), list)
+        and all(entry is None or (_is_of(entry, _is_count) and entry.keys() == {"seed", "episode"}) for entry in info["environments"]),
+        "replay_ratio": _is_of(info.get("replay_ratio"), lambda value: value is None or isinstance(value, str | int)),
+        "random_return": info.get("random_return") is None or _is_number(info["random_return"]),
+        "evaluation": info.get("evaluation") is None
+        or (_is_of(info["evaluation"], _is_number) and info["evaluation"].keys() == {"step", "return"}),
+        "returns": isinstance(info.get("returns"), list) and all(map(_is_number, info["returns"])),
+        "metrics": _is_of(
+            info.get("metrics"), lambda mean: isinstance(mean, list) and len(mean) == 2 and all(map(_is_number, mean)) and mean[1] >= 1
+        ),
+        "log": _is_count(info.get("log")),
+        "replay": isinstance(info.get("replay"), dict),
+    }
+    wrong = [name for name, is_sound in sound.items() if name not in info or not is_sound]
+    if wrong:
+        raise UserError(f"the checkpoint {saved.path} does not fit this version: run.json lacks a sound {', '.join(wrong)}")
+
+
+def _require_same_form(expected: Mapping[str, np.ndarray], arrays: Mapping[str, np.ndarray]) -> None:
+    for name, array in expected.items():
+        if arrays[name].shape != array.shape or arrays[name].dtype != array.dtype:
+            raise ValueError(f"{name} is {arrays[name].dtype}{list(arrays[name].shape)}; expected {array.dtype}{list(array.shape)}")
+
+
+def _is_of(value: Any, is_sound: Callable[[Any], bool]) -> bool:
+    return isinstance(value, dict) and all(map(is_sound, value.values()))
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _is_count(value: Any) -> bool:
+    return _is_number(value) and 0 <= value < 2**63
 
 
 def _prefixed(prefix: str, arrays: Mapping[str, Any]) -> Arrays:

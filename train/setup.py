@@ -31,12 +31,12 @@ def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -
     _require_trainable(options)
     display = stack.enter_context(Display(options.steps))
     saved = _find_checkpoint(options, display)
-    learner_type = learner or _import_learner(options.backend)
+    learner_type = learner or import_learner(options.backend)
     envs, test_envs = _make_environments(options, stack)
     if saved:
         checkpoint.require_same_spaces(saved, envs.spaces.to_json())
     parameters = _count_parameters(options, envs.spaces)
-    agent = _make_learner(learner_type, options, envs.spaces)  # Before preflight: it says what is wrong with the device.
+    agent = make_learner(learner_type, options, envs.spaces)  # Before preflight: it says what is wrong with the device.
     report = _preflight(options, envs.spaces, display) if options.preflight else None
     replay, saved, record = _open_replay(options, saved, envs, display)
     starts, step = _progress(options, saved)
@@ -113,7 +113,7 @@ def _find_checkpoint(options: Options, display: Display) -> Checkpoint | None:
     return saved
 
 
-def _import_learner(backend: str) -> type[Learner]:
+def import_learner(backend: str) -> type[Learner]:
     try:
         return learner_class(backend)
     except ModuleNotFoundError as error:
@@ -157,7 +157,7 @@ def _preflight(options: Options, spaces: Spaces, display: Display) -> "Report":
     return report
 
 
-def _make_learner(learner: type[Learner], options: Options, spaces: Spaces) -> Learner:
+def make_learner(learner: type[Learner], options: Options, spaces: Spaces) -> Learner:
     try:
         return learner(
             spaces, options.config, seed=derive_seed(options.seed, "parameters", 0), device=options.device, nonfinite=options.nonfinite

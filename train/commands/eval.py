@@ -21,7 +21,7 @@ from train.errors import UserError
 from train.evaluation import Agent, Episode, play_episodes
 from train.options import Options
 from train.saved_agent import SavedAgent, agent_of
-from train.setup import _import_learner, _make_learner
+from train.setup import import_learner, make_learner
 
 BACKENDS = ("jax", "torch")
 DESCRIPTION = """Play episodes with the agent of a checkpoint. It samples its actions, as in training.
@@ -50,13 +50,13 @@ def main(arguments: Sequence[str]) -> int:
         action_repeat=saved.info["action_repeat"],
         image_size=saved.info["image_size"],
     )
-    learner_type = _import_learner(options.backend)
+    learner_type = import_learner(options.backend)
     make = functools.partial(make_env, options.task, image_size=options.image_size, action_repeat=options.action_repeat)
     count = min(saved.config.envs, values.episodes)
     with closing(Environments(make, count, count > 1 and is_slow(make, options.seed))) as envs:
         if envs.spaces != saved.spaces:
             raise UserError(f"the task {options.task} has the spaces {envs.spaces}; the agent of {checkpoint.path} has {saved.spaces}")
-        learner = _make_learner(learner_type, options, saved.spaces)
+        learner = make_learner(learner_type, options, saved.spaces)
         try:
             learner.load_state_dict(checkpoint.learner)
         except ValueError as error:
