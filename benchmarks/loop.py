@@ -18,8 +18,9 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces as gym
 
-from benchmarks.machine import command, describe
+from benchmarks.machine import command
 from train.logger import read_metrics
+from train.machine import describe
 
 EPISODE = 200
 SLOW_STEP = 0.02  # seconds
