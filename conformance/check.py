@@ -69,11 +69,27 @@ class Worst:
     where: str = ""
 
 
+@dataclasses.dataclass(frozen=True)
+class Call:
+    """A call of the candidate, and the comparison of what came of it that went wrong.
+
+    function and arguments: as the candidate was called; arrays are copies, so that a candidate that writes into them hides nothing. got
+    and expected: the two arrays that disagree, None where no arrays were compared. index: of the worst element, None where shapes differ.
+    """
+
+    function: str
+    arguments: tuple[Any, ...]
+    got: np.ndarray | None = None
+    expected: np.ndarray | None = None
+    index: tuple[int, ...] | None = None
+
+
 class Run:
     """One check on one adapter.
 
     dtype: precision of the candidate. profile: name of the profile that configurations are drawn from. seed and examples: of the drawn
-    cases. `compared` counts numbers compared, so that a check that compares nothing can be told from one that passes.
+    cases. `compared` counts numbers compared, so that a check that compares nothing can be told from one that passes. `last_call` is the
+    last call of the candidate: after a deviation, that of the smallest case that deviates.
     """
 
     def __init__(self, adapter: object, dtype: str, profile: str, seed: int = 0, examples: int = 25) -> None:
@@ -84,6 +100,7 @@ class Run:
         self.examples = examples
         self.worst = Worst()
         self.compared = 0
+        self.last_call: Call | None = None
 
     @property
     def u(self) -> float:
@@ -103,6 +120,7 @@ class Run:
         return round_to(x, self.dtype)
 
     def call(self, function: str, *args: Any) -> Any:
+        self.last_call = Call(function, _copied(args))
         return getattr(self.adapter, function)(*args)
 
     def expect(self, function: str, args: tuple[Any, ...], expected: Any, **how: Any) -> Any:
@@ -181,19 +199,37 @@ class Run:
         expected = np.asarray(expected, np.float64)
         if actual.shape != expected.shape:
             self.worst = Worst(math.inf, math.inf, where)
+            self._note(actual, expected, None)
             raise Deviation(f"{where}: {_shapes(expected.shape, actual.shape)}")
         self.compared += expected.size
         if not expected.size:
             return
         deviation = relative_deviation(actual, expected, magnitude, self.tiny / self.u)
-        index = np.unravel_index(np.argmax(deviation), deviation.shape)
+        index = tuple(map(int, np.unravel_index(np.argmax(deviation), deviation.shape)))
         largest = float(deviation[index])
         share = largest / bound if bound else (0.0 if largest == 0 else math.inf)
         place = f"{where}[{', '.join(map(str, index))}]" if index else where
         if share > self.worst.share or not self.worst.where:
             self.worst = Worst(share, largest, place)
         if share > 1:
-            raise Deviation(f"{place}: got {actual[index]!r}, expected {expected[index]!r}, off by {largest:.3g}, allowed {bound:.3g}")
+            self._note(actual, expected, index)
+            got, wanted = float(actual[index]), float(expected[index])
+            raise Deviation(f"{place}: got {got!r}, expected {wanted!r}, off by {largest:.3g}, allowed {bound:.3g}")
+
+    def _note(self, got: np.ndarray, expected: np.ndarray, index: tuple[int, ...] | None) -> None:
+        if self.last_call is not None:
+            self.last_call = dataclasses.replace(self.last_call, got=got, expected=expected, index=index)
+
+
+def _copied(value: Any) -> Any:
+    """The value with copies of its arrays."""
+    if isinstance(value, np.ndarray):
+        return value.copy()
+    if isinstance(value, dict):
+        return {key: _copied(entry) for key, entry in value.items()}
+    if isinstance(value, tuple):
+        return tuple(map(_copied, value))
+    return value
 
 
 def _shapes(expected: tuple[int, ...], actual: tuple[int, ...]) -> str:
