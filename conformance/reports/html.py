@@ -29,12 +29,14 @@ def render(results: Sequence[Data]) -> str:
         '<p class="muted">What an implementation computes, held against the specification requirement by requirement.</p>',
         f'<div class="cards">{"".join(map(_card, results))}</div>',
         *(_diagnoses(data, len(results) > 1) for data in results),
-        "<h2>Requirements</h2>",
-        '<p class="small muted">A percentage is the worst deviation as a share of what is allowed; 100% is the limit. '
-        "Open a chapter for its requirements.</p>",
-        _matrix(results),
+        "<h2>Chapters</h2>",
+        '<p class="small muted">The bar is the worst deviation as a share of what is allowed.</p>',
+        _overview(results),
         *(_expected(data, len(results) > 1) for data in results),
         *(_failures(data, position, len(results) > 1) for position, data in enumerate(results)),
+        "<h2>Requirements</h2>",
+        '<p class="small muted">A percentage is the worst deviation as a share of what is allowed: 100% is the limit.</p>',
+        _matrix(results),
     ]
     return "\n".join(["<!doctype html>", '<html lang="en-GB"><head>', *head, "</head><body>", *filter(None, body), "</body></html>"]) + "\n"
 
@@ -56,10 +58,8 @@ def _card(data: Data) -> str:
     passed, counts = data["verdict"]["passed"], summary.counts(data)
     edition = data["implementation"]["edition"]
     failing = counts["fail"] + counts["error"]
-    others = [
-        f"{failing} fail" if failing else "",
-        *(f"{counts[name]} {name}" for name in ("expected failure", "not offered") if counts[name]),
-    ]
+    others = [f"{failing} fail"] if failing else []
+    others += [f"{counts[name]} {name}" for name in ("expected failure", "not offered") if counts[name]]
     problems = "".join(f"<li>{escape(problem)}</li>" for problem in data["verdict"]["problems"])
     versions = ", ".join(f"{name} {version}" for name, version in data["versions"].items())
     lines = [
@@ -85,25 +85,42 @@ def _heads(results: Sequence[Data]) -> str:
     return "".join(f"<th class=cell>{escape(head)}</th>" for head in heads)
 
 
-def _matrix(results: Sequence[Data]) -> str:
-    """An overview by chapter, and the requirements of each chapter."""
+def _by_path(results: Sequence[Data]) -> tuple[list[str], list[dict[str, summary.Chapter]]]:
+    """The chapters of all results in the order of the book, and those of each."""
     found = [{chapter.path: chapter for chapter in summary.chapters(data)} for data in results]
-    paths = sorted({path for chapters in found for path in chapters})
-    rows, parts = [], []
+    return sorted({path for chapters in found for path in chapters}), found
+
+
+def _overview(results: Sequence[Data]) -> str:
+    """A line for each chapter."""
+    paths, found = _by_path(results)
+    rows = (
+        f'<tr><th><a href="#{_chapter_identifier(path)}">{escape(summary.title(path))}</a></th>'
+        f"{''.join(_chapter_cell(chapters.get(path)) for chapters in found)}</tr>"
+        for path in paths
+    )
+    head = f"<thead><tr><th></th>{_heads(results)}</tr></thead>"
+    return f'<div class="scroll"><table class="matrix overview">{head}<tbody>{"".join(rows)}</tbody></table></div>'
+
+
+def _matrix(results: Sequence[Data]) -> str:
+    """The requirements of each chapter; chapters with a failure are open."""
+    paths, found = _by_path(results)
+    parts = []
     for path in paths:
-        number = summary.title(path).partition(" ")[0]
-        cells = "".join(_chapter_cell(chapters.get(path)) for chapters in found)
-        rows.append(f'<tr><th><a href="#chapter-{escape(number)}">{escape(summary.title(path))}</a></th>{cells}</tr>')
-        names = list(dict.fromkeys(name for chapters in found if path in chapters for name in chapters[path].requirements))
-        is_open = any(chapters[path].counts["fail"] + chapters[path].counts["error"] for chapters in found if path in chapters)
-        inner = f"<p>{chapter_link(path)}</p>" + _requirements(results, names)
-        opened = " open" if is_open else ""
+        here = [chapters[path] for chapters in found if path in chapters]
+        names = list(dict.fromkeys(name for chapter in here for name in chapter.requirements))
+        opened = " open" if any(chapter.counts["fail"] + chapter.counts["error"] for chapter in here) else ""
+        heading = f"{escape(summary.title(path))}, {len(names)} requirements"
         parts.append(
-            f'<details class="box" id="chapter-{escape(number)}"{opened}><summary>{escape(summary.title(path))}, '
-            f"{len(names)} requirements</summary>{inner}</details>"
+            f'<details class="box" id="{_chapter_identifier(path)}"{opened}><summary>{heading}</summary>'
+            f"<p>{chapter_link(path)}</p>{_requirements(results, names)}</details>"
         )
-    head = f"<thead><tr><th>chapter</th>{_heads(results)}</tr></thead>"
-    return f'<div class="scroll"><table class="matrix">{head}<tbody>{"".join(rows)}</tbody></table></div>' + "".join(parts)
+    return "".join(parts)
+
+
+def _chapter_identifier(path: str) -> str:
+    return "chapter-" + re.sub(r"[^A-Za-z0-9]", "-", path)
 
 
 def _chapter_cell(chapter: summary.Chapter | None) -> str:
@@ -123,7 +140,7 @@ def _requirements(results: Sequence[Data], names: Sequence[str]) -> str:
     rows = (
         f"<tr><th>{escape(name)}</th>"
         f"{''.join(_requirement_cell(data, position, name) for position, data in enumerate(results))}"
-        f'<td class="text">{prose(texts[name])}</td></tr>'
+        f'<td class="text"><div>{prose(texts[name])}</div></td></tr>'
         for name in names
     )
     head = f"<thead><tr><th></th>{_heads(results)}<th class=text></th></tr></thead>"
@@ -197,6 +214,7 @@ def _failure(data: Data, position: int, name: str, check: Data, is_open: bool) -
     chapter = {data["requirements"][name]["chapter"] for name in check["requirements"] if name in data["requirements"]}
     diagnoses = summary.matching(data, name)
     links = ", ".join(map(chapter_link, sorted(chapter)))
+    links = ", ".join(map(chapter_link, sorted(chapter)))
     parts = [
         f"<p>{prose(check['summary'])}</p>",
         f'<p class="small muted">{escape(", ".join(check["requirements"]))}: {links}</p>',
@@ -208,7 +226,8 @@ def _failure(data: Data, position: int, name: str, check: Data, is_open: bool) -
     ]
     kind, opened = ("known" if is_expected else "bad"), (" open" if is_open else "")
     summary_line = f"{escape(name)} <span class=muted>{escape(check['status'])}</span>"
-    return f'<details class="box {kind}" id="{_identifier(position, name)}"{opened}><summary>{summary_line}</summary>{"".join(parts)}</details>'
+    heading = f'<details class="box {kind}" id="{_identifier(position, name)}"{opened}><summary>{summary_line}</summary>'
+    return f"{heading}{''.join(parts)}</details>"
 
 
 def _values(failure: Data) -> str:

@@ -5,6 +5,7 @@ import functools
 import importlib.metadata
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from importlib import resources
 from typing import Any
 
 Data = Mapping[str, Any]
@@ -30,9 +31,15 @@ class Chapter:
 
 
 def title(path: str) -> str:
-    """07 Returns, of spec/07-returns.md."""
-    number, _, words = path.rpartition("/")[2].removesuffix(".md").partition("-")
-    return f"{number} {words.replace('-', ' ').capitalize()}"
+    """The heading of a chapter: 07 Returns, of spec/07-returns.md. Of what is no chapter, the path."""
+    return _titles().get(path, path)
+
+
+@functools.cache
+def _titles() -> dict[str, str]:
+    files = [file for file in resources.files("spec").iterdir() if file.name.endswith(".md")]
+    headings = {f"spec/{file.name}": file.read_text(encoding="utf-8").partition("\n")[0] for file in files}
+    return {path: heading.lstrip("# ").replace(" · ", " ") for path, heading in headings.items()}
 
 
 def chapters(data: Data) -> list[Chapter]:
