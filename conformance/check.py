@@ -18,6 +18,7 @@ EPSILON = {"float64": 2.0**-52, "float32": 2.0**-23, "bfloat16": 2.0**-7}
 SMALLEST_NORMAL = {"float64": 2.0**-1022, "float32": 2.0**-126, "bfloat16": 2.0**-126}
 # Rounding of one function, relative to the magnitude of what it sums. float64 is held to 1e-12; the others to multiples of their epsilon.
 BOUND = {"float64": 1e-12, "float32": 64 * EPSILON["float32"], "bfloat16": 16 * EPSILON["bfloat16"]}
+COPIED = 2**16  # numbers of an array up to which a failing input is kept as it was
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,7 +74,8 @@ class Worst:
 class Call:
     """A call of the candidate, and the comparison of what came of it that went wrong.
 
-    function and arguments: as the candidate was called; arrays are copies, so that a candidate that writes into them hides nothing. got
+    function and arguments: as the candidate was called; arrays that are not large are copies, so that a candidate that writes into them
+    hides nothing. got
     and expected: the two arrays that disagree, None where no arrays were compared. index: of the worst element, None where shapes differ.
     """
 
@@ -222,9 +224,9 @@ class Run:
 
 
 def _copied(value: Any) -> Any:
-    """The value with copies of its arrays."""
+    """The value with copies of its arrays. Those of full-size networks, in the preflight, stay as they are."""
     if isinstance(value, np.ndarray):
-        return value.copy()
+        return value.copy() if value.size <= COPIED else value
     if isinstance(value, dict):
         return {key: _copied(entry) for key, entry in value.items()}
     if isinstance(value, tuple):

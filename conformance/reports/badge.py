@@ -37,7 +37,11 @@ def outcome(data: Data) -> tuple[str, str]:
         failing = counts["fail"] + counts["error"]
         return (f"{failing} of {offered} checks fail" if failing else "failing"), RED
     expected = counts["expected failure"]
-    return (f"{counts['pass']} of {offered} checks", YELLOW) if expected else (f"{offered} checks pass", GREEN)
+    return (
+        (f"{counts['pass']} of {offered} checks", YELLOW)
+        if expected
+        else (f"{offered} {'check passes' if offered == 1 else 'checks pass'}", GREEN)
+    )
 
 
 def _text(words: str, x: float, width: float) -> str:

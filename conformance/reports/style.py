@@ -49,7 +49,7 @@ details { margin: .4rem 0; } summary { cursor: pointer; overflow-wrap: anywhere;
 .diagnosis { background: var(--card); border-radius: 8px; padding: .6rem 1rem; margin: .6rem 0; border-left: 4px solid var(--known); }
 .diagnosis p { margin: .1rem 0; }
 .values td:first-child { white-space: nowrap; } .values td:nth-child(2) { white-space: nowrap; color: var(--muted); font-size: .85rem; }
-@media (max-width: 40rem) { .overview { width: auto; }
+@media (max-width: 40rem) { .overview tbody th { white-space: normal; } .overview { width: auto; }
 .matrix .text div { display: -webkit-box; -webkit-box-orient: vertical; -webkit-line-clamp: 3; overflow: hidden; }
 .matrix .text { display: none; } .matrix .cell { min-width: 5.5rem; width: auto; }
   .values, .values tbody, .values tr, .values td { display: block; } .values td { border: 0; padding: 0; }

@@ -38,7 +38,7 @@ def title(path: str) -> str:
 @functools.cache
 def _titles() -> dict[str, str]:
     files = [file for file in resources.files("spec").iterdir() if file.name.endswith(".md")]
-    headings = {f"spec/{file.name}": file.read_text(encoding="utf-8").partition("\n")[0] for file in files}
+    headings = {f"spec/{file.name}": file.read_text(encoding="utf-8").partition("\n")[0].partition(":")[0] for file in files}
     return {path: heading.lstrip("# ").replace(" · ", " ") for path, heading in headings.items()}
 
 

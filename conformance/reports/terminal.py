@@ -1,5 +1,8 @@
 """The result in a terminal: a line for each chapter, what failed, and the outcome."""
 
+import re
+from typing import Any
+
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -13,6 +16,8 @@ LINES = 10  # of one message: the last of a traceback say what happened
 
 
 def show(console: Console, data: Data) -> None:
+    """Prints it. Control characters of an implementation's messages do nothing."""
+    data = _printable(data)
     title = f"{summary.label(data)}: {summary.settings(data)}"
     table = Table(title=escape(title), title_justify="left", title_style="")
     for column in ("chapter", "requirements", "worst, of allowed", "where"):
@@ -44,3 +49,11 @@ def show(console: Console, data: Data) -> None:
     if not summary.offered(data):
         console.print("nothing was checked: the functions that these checks need are not offered", markup=False, highlight=False)
     console.print(f"[{'bold green' if data['verdict']['passed'] else 'bold red'}]{escape(summary.headline(data))}[/]", highlight=False)
+
+
+def _printable(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {_printable(key): _printable(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        return list(map(_printable, value))
+    return re.sub(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]", "\N{REPLACEMENT CHARACTER}", value) if isinstance(value, str) else value
