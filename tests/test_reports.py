@@ -401,6 +401,11 @@ def test_the_same_seed_gives_the_same_cases() -> None:
     assert heard(1) != heard(2)
 
 
+def test_shares() -> None:
+    shares = {None: "no number", 0.0: "0%", 0.344: "34%", 9.5: "950%", 123.4: "123×", 3.21e14: "3e14×"}
+    assert {share: summary.percent(share) for share in shares} == shares
+
+
 def test_a_run_prints_its_seed_and_version(data: dict[str, Any]) -> None:
     assert "seed 3, 5 examples, dreamer-spec" in shown(data)
     assert summary.settings({**data, "versions": {"dreamer-spec": "9.9"}}).endswith("dreamer-spec 9.9")

@@ -35,7 +35,7 @@ def render(results: Sequence[Data]) -> str:
         *(_expected(data, len(results) > 1) for data in results),
         *(_failures(data, position, len(results) > 1) for position, data in enumerate(results)),
         "<h2>Requirements</h2>",
-        '<p class="small muted">A percentage is the worst deviation as a share of what is allowed: 100% is the limit.</p>',
+        '<p class="small muted">A percentage is the worst deviation as a share of what is allowed: 100% is the limit. Empty: not run.</p>',
         _matrix(results),
     ]
     return "\n".join(["<!doctype html>", '<html lang="en-GB"><head>', *head, "</head><body>", *filter(None, body), "</body></html>"]) + "\n"

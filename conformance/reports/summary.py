@@ -120,7 +120,7 @@ def percent(share: float | None) -> str:
     if share is None:
         return "no number"
     if share > 10:
-        return f"{share:.0f}×" if share < 1e4 else f"{share:.0e}×"
+        return f"{share:.0f}×" if share < 1e4 else f"{share:.0e}×".replace("e+", "e")
     return f"{share:.0%}"
 
 
