@@ -90,8 +90,7 @@ class Run:
     """One check on one adapter.
 
     dtype: precision of the candidate. profile: name of the profile that configurations are drawn from. seed and examples: of the drawn
-    cases. `compared` counts numbers compared, so that a check that compares nothing can be told from one that passes. `last_call` is the
-    last call of the candidate: after a deviation, that of the smallest case that deviates.
+    cases. `compared` counts numbers compared, so that a check that compares nothing can be told from one that passes.
     """
 
     def __init__(self, adapter: object, dtype: str, profile: str, seed: int = 0, examples: int = 25) -> None:
@@ -102,7 +101,7 @@ class Run:
         self.examples = examples
         self.worst = Worst()
         self.compared = 0
-        self.last_call: Call | None = None
+        self.last_call: Call | None = None  # of the candidate; after a deviation, that of the smallest case that deviates
 
     @property
     def u(self) -> float:
