@@ -18,6 +18,7 @@ EPSILON = {"float64": 2.0**-52, "float32": 2.0**-23, "bfloat16": 2.0**-7}
 SMALLEST_NORMAL = {"float64": 2.0**-1022, "float32": 2.0**-126, "bfloat16": 2.0**-126}
 # Rounding of one function, relative to the magnitude of what it sums. float64 is held to 1e-12; the others to multiples of their epsilon.
 BOUND = {"float64": 1e-12, "float32": 64 * EPSILON["float32"], "bfloat16": 16 * EPSILON["bfloat16"]}
+COPIED = 2**16  # numbers of an array up to which a failing input is kept as it was
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,6 +70,22 @@ class Worst:
     where: str = ""
 
 
+@dataclasses.dataclass(frozen=True)
+class Call:
+    """A call of the candidate, and the comparison of what came of it that went wrong.
+
+    function and arguments: as the candidate was called; arrays that are not large are copies, so that a candidate that writes into them
+    hides nothing. got
+    and expected: the two arrays that disagree, None where no arrays were compared. index: of the worst element, None where shapes differ.
+    """
+
+    function: str
+    arguments: tuple[Any, ...]
+    got: np.ndarray | None = None
+    expected: np.ndarray | None = None
+    index: tuple[int, ...] | None = None
+
+
 class Run:
     """One check on one adapter.
 
@@ -84,6 +101,7 @@ class Run:
         self.examples = examples
         self.worst = Worst()
         self.compared = 0
+        self.last_call: Call | None = None  # of the candidate; after a deviation, that of the smallest case that deviates
 
     @property
     def u(self) -> float:
@@ -103,6 +121,7 @@ class Run:
         return round_to(x, self.dtype)
 
     def call(self, function: str, *args: Any) -> Any:
+        self.last_call = Call(function, _copied(args))
         return getattr(self.adapter, function)(*args)
 
     def expect(self, function: str, args: tuple[Any, ...], expected: Any, **how: Any) -> Any:
@@ -181,19 +200,37 @@ class Run:
         expected = np.asarray(expected, np.float64)
         if actual.shape != expected.shape:
             self.worst = Worst(math.inf, math.inf, where)
+            self._note(actual, expected, None)
             raise Deviation(f"{where}: {_shapes(expected.shape, actual.shape)}")
         self.compared += expected.size
         if not expected.size:
             return
         deviation = relative_deviation(actual, expected, magnitude, self.tiny / self.u)
-        index = np.unravel_index(np.argmax(deviation), deviation.shape)
+        index = tuple(map(int, np.unravel_index(np.argmax(deviation), deviation.shape)))
         largest = float(deviation[index])
         share = largest / bound if bound else (0.0 if largest == 0 else math.inf)
         place = f"{where}[{', '.join(map(str, index))}]" if index else where
         if share > self.worst.share or not self.worst.where:
             self.worst = Worst(share, largest, place)
         if share > 1:
-            raise Deviation(f"{place}: got {actual[index]!r}, expected {expected[index]!r}, off by {largest:.3g}, allowed {bound:.3g}")
+            self._note(actual, expected, index)
+            got, wanted = float(actual[index]), float(expected[index])
+            raise Deviation(f"{place}: got {got!r}, expected {wanted!r}, off by {largest:.3g}, allowed {bound:.3g}")
+
+    def _note(self, got: np.ndarray, expected: np.ndarray, index: tuple[int, ...] | None) -> None:
+        if self.last_call is not None:
+            self.last_call = dataclasses.replace(self.last_call, got=got, expected=expected, index=index)
+
+
+def _copied(value: Any) -> Any:
+    """The value with copies of its arrays. Those of full-size networks, in the preflight, stay as they are."""
+    if isinstance(value, np.ndarray):
+        return value.copy() if value.size <= COPIED else value
+    if isinstance(value, dict):
+        return {key: _copied(entry) for key, entry in value.items()}
+    if isinstance(value, tuple):
+        return tuple(map(_copied, value))
+    return value
 
 
 def _shapes(expected: tuple[int, ...], actual: tuple[int, ...]) -> str:

@@ -1,22 +1,42 @@
 """Runs checks on an adapter and sums the results up by requirement."""
 
 import dataclasses
+import math
 import traceback
 from collections.abc import Iterable
 
-from conformance.check import CHECKS, CandidateLost, Check, Deviation, Run, Worst
+from conformance.check import CHECKS, Call, CandidateLost, Check, Deviation, Run, Worst
 from conformance.requirements import requirements
 
 
 @dataclasses.dataclass(frozen=True)
 class Result:
-    """What one check found. status: "pass", "fail", "error" (the candidate raised) or "not offered"."""
+    """What one check found. status: "pass", "fail", "error" (the candidate raised) or "not offered".
+
+    call: where it failed, the last call of the candidate; None where it was not called.
+    """
 
     check: Check
     status: str
     worst: Worst
     compared: int
     message: str = ""
+    call: Call | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """What a run was asked to do. candidate: its name, or the command of a process. at_least: how many checks must pass."""
+
+    candidate: str
+    process: bool
+    dtype: str
+    device: str | None
+    profile: str
+    only: str
+    seed: int
+    examples: int
+    at_least: int
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,11 +72,11 @@ def run_check(check: Check, adapter: object, dtype: str, profile: str, seed: int
     try:
         check.body(run)
     except Deviation as deviation:
-        return Result(check, "fail", run.worst, run.compared, str(deviation))
+        return Result(check, "fail", run.worst, run.compared, str(deviation), run.last_call)
     except CandidateLost as lost:
-        return Result(check, "error", Worst(float("inf"), float("inf"), check.name), run.compared, str(lost))
+        return Result(check, "error", Worst(math.inf, math.inf, check.name), run.compared, str(lost), run.last_call)
     except Exception:
-        return Result(check, "error", Worst(float("inf"), float("inf"), check.name), run.compared, traceback.format_exc(limit=-4))
+        return Result(check, "error", Worst(math.inf, math.inf, check.name), run.compared, traceback.format_exc(limit=-4), run.last_call)
     if not run.compared:
         return Result(check, "error", run.worst, 0, "the check compared nothing")
     return Result(check, "pass", run.worst, run.compared)

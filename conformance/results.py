@@ -1,9 +1,27 @@
-"""Results as plain JSON types."""
+"""The result of a run as plain JSON types: report.schema.json says what is in it. Every report is made from it and from nothing else."""
 
+import dataclasses
+import functools
 import importlib.metadata
 import json
+import platform
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from importlib import resources
 from pathlib import Path
 from typing import Any
+
+from conformance.errors import UserError
+from conformance.execute import Result, Row, Settings, rows
+from conformance.expected import ExpectedFailures
+from conformance.foreign import ForeignAdapter
+from conformance.reports.reproduce import failure
+from conformance.requirements import chapter_of, requirements
+
+FORMAT = 1
+FAILING = ("fail", "error")
+
+Data = dict[str, Any]
 
 
 def finite(number: float) -> float | None:
@@ -14,9 +32,166 @@ def finite(number: float) -> float | None:
 def versions() -> dict[str, str]:
     """Of the kit and of what it stands on."""
     installed = {distribution.name: distribution.version for distribution in importlib.metadata.distributions()}
-    return {name: installed[name] for name in ("dreamer-spec", "numpy", "jax", "torch") if name in installed}
+    names = ("dreamer-spec", "numpy", "hypothesis", "jax", "torch")
+    return {"python": platform.python_version(), **{name: installed[name] for name in names if name in installed}}
 
 
-def write(path: Path, report: dict[str, Any]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+def identity(adapter: object, settings: Settings) -> Data:
+    """Name, version and claimed edition of the candidate. One of our own columns has the version of the kit, and claims none."""
+    if isinstance(adapter, ForeignAdapter):
+        return {"name": adapter.name, "version": adapter.version, "edition": adapter.edition()}
+    return {"name": settings.candidate, "version": versions().get("dreamer-spec", ""), "edition": None}
+
+
+def result_data(
+    settings: Settings,
+    implementation: Mapping[str, Any],
+    results: Iterable[Result],
+    expected: ExpectedFailures,
+    diagnoses: Sequence[Mapping[str, Any]] = (),
+) -> Data:
+    """A run and everything that was found.
+
+    Args:
+      implementation: of `identity`.
+      diagnoses: of the mutants that the candidate behaves like, each as the schema's `diagnosis` says.
+
+    `share` is the worst deviation as a share of the allowed one; it is null where what failed has no size.
+    """
+    results = list(results)
+    return {
+        "format": FORMAT,
+        "date": time.strftime("%Y-%m-%d", time.gmtime()),
+        **dataclasses.asdict(settings),
+        "implementation": dict(implementation),
+        "versions": versions(),
+        "verdict": verdict(settings, results, expected),
+        "expected_failures": [
+            {"name": name, "reason": reason, "outcome": expected.outcome(name, results)} for name, reason in expected.reasons.items()
+        ],
+        "checks": {result.check.name: _check(result, settings, expected) for result in results},
+        "requirements": {row.requirement: _requirement(row) for row in rows(results)},
+        "diagnoses": [dict(diagnosis) for diagnosis in diagnoses],
+    }
+
+
+def verdict(settings: Settings, results: Sequence[Result], expected: ExpectedFailures) -> Data:
+    """Whether the run passed, and what stands against it."""
+    statuses = [result.status for result in results if expected.reason(result.check) is None or result.status not in FAILING]
+    failing, passing = sum(status in FAILING for status in statuses), statuses.count("pass")
+    problems = [f"{_checks(failing)} failed"] if failing else []
+    problems += [f"{name} passes, and is expected to fail" for name in expected.reasons if expected.outcome(name, results) == "pass"]
+    if passing < settings.at_least:
+        problems.append(f"{_checks(passing)} passed, and at least {settings.at_least} must")
+    return {"passed": not problems, "problems": problems}
+
+
+def _checks(count: int) -> str:
+    return f"{count} {'check' if count == 1 else 'checks'}"
+
+
+def _check(result: Result, settings: Settings, expected: ExpectedFailures) -> Data:
+    check = result.check
+    return {
+        "status": result.status,
+        "requirements": list(check.requirements),
+        "level": check.level,
+        "summary": check.summary,
+        "compared": result.compared,
+        "deviation": finite(result.worst.deviation),
+        "share": finite(result.worst.share),
+        "where": result.worst.where,
+        "message": result.message,
+        "expected_failure": expected.reason(check),
+        "failure": failure(result, settings) if result.status in FAILING else None,
+    }
+
+
+def _requirement(row: Row) -> Data:
+    return {
+        "status": row.status,
+        "chapter": chapter_of(row.requirement),
+        "text": requirements()[row.requirement],
+        "checks": [result.check.name for result in row.results],
+        "deviation": finite(row.worst.deviation),
+        "share": finite(row.worst.share),
+        "where": row.worst.where,
+    }
+
+
+def write(path: Path, report: Data) -> None:
+    write_text(path, json.dumps(report, indent=1) + "\n")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Raises UserError where that is not possible."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise UserError(f"cannot write {path}: {error.strerror}") from error
+
+
+@functools.cache
+def schema() -> Data:
+    return dict(json.loads(resources.files("conformance").joinpath("report.schema.json").read_text(encoding="utf-8")))
+
+
+def read(path: Path) -> Data:
+    """A result that `conformance check --json` has written.
+
+    Raises:
+      UserError: there is none, or the file is something else.
+    """
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{path} is not JSON: {error}") from error
+    if problem := misfit(data, schema()):
+        raise UserError(f"{path} is not a result of format {FORMAT}: {problem}; make one with: conformance check ... --json {path}")
+    return dict(data)
+
+
+_KINDS: dict[str, Any] = {"object": dict, "array": list, "string": str, "boolean": bool, "null": type(None), "number": int | float}
+
+
+def misfit(value: Any, rule: Mapping[str, Any], place: str = "it") -> str:
+    """What is the first thing in a value that the schema does not allow; "" if all is well. Knows the words that our schema uses."""
+    if "$ref" in rule:
+        rule = schema()["$defs"][rule["$ref"].removeprefix("#/$defs/")]
+    kinds = [rule["type"]] if isinstance(rule.get("type"), str) else rule.get("type", [])
+    if kinds and not any(_is_kind(value, kind) for kind in kinds):
+        return f"{place} must be of type {' or '.join(kinds)}"
+    if "const" in rule and value != rule["const"]:
+        return f"{place} must be {rule['const']!r}"
+    if "enum" in rule and value not in rule["enum"]:
+        return f"{place} must be one of {rule['enum']}"
+    if "anyOf" in rule:
+        problems = [misfit(value, option, place) for option in rule["anyOf"]]
+        return "" if "" in problems else problems[-1]
+    if isinstance(value, dict):
+        return _misfit_in_object(value, rule, place)
+    if isinstance(value, list) and "items" in rule:
+        return next(filter(None, (misfit(entry, rule["items"], f"{place}[{index}]") for index, entry in enumerate(value))), "")
+    return ""
+
+
+def _misfit_in_object(value: Mapping[str, Any], rule: Mapping[str, Any], place: str) -> str:
+    for name in rule.get("required", ()):
+        if name not in value:
+            return f"{place} lacks {name!r}"
+    known, others = rule.get("properties", {}), rule.get("additionalProperties", {})
+    for name, entry in value.items():
+        if name not in known and others is False:
+            return f"{place} must not have {name!r}"
+        if problem := misfit(entry, known.get(name, others), f"{place}.{name}"):
+            return problem
+    return ""
+
+
+def _is_kind(value: Any, kind: str) -> bool:
+    if kind == "integer":
+        return type(value) is int
+    return isinstance(value, _KINDS[kind]) and (kind == "boolean" or not isinstance(value, bool))

@@ -1,21 +1,26 @@
 """Run the checks on an implementation."""
 
 import argparse
-from collections import Counter
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
-from rich.table import Table
 
 from conformance.candidate import candidate, remarks
-from conformance.check import DTYPES
+from conformance.check import DTYPES, Check
 from conformance.errors import UserError
-from conformance.execute import Result, rows, run_check, selected_checks
-from conformance.results import finite, versions, write
+from conformance.execute import Result, Settings, run_check, selected_checks
+from conformance.expected import ExpectedFailures, read_expected
+from conformance.reports import badge, html, junit, markdown, terminal
+from conformance.results import Data, identity, result_data, write, write_text
 from spec import profiles
 
-STYLE = {"pass": "green", "fail": "bold red", "error": "bold red", "not offered": "yellow"}
+RENDERED: dict[str, Callable[[Data], str]] = {
+    "markdown": markdown.render,
+    "junit": junit.render,
+    "html": lambda data: html.render([data]),
+    "badge": badge.render,
+}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -32,69 +37,45 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--only", default="", help="only checks whose name or requirement id contains this")
     parser.add_argument("--seed", type=int, default=0, help="seed of the drawn cases")
     parser.add_argument("--examples", type=int, default=25, help="cases that hypothesis draws for each property")
-    parser.add_argument("--json", type=Path, default=None, metavar="FILE", help="write the results to this file, too")
+    parser.add_argument("--expect", type=Path, metavar="FILE", help="failures that are known, each with a reason: see docs/reports.md")
+    parser.add_argument("--at-least", type=int, default=1, metavar="N", help="fail unless so many checks pass")
+    files = parser.add_argument_group("reports, written to files")
+    files.add_argument("--json", type=Path, metavar="FILE", help="the whole result, see conformance/report.schema.json")
+    files.add_argument("--markdown", type=Path, metavar="FILE", help="the result for people")
+    files.add_argument("--junit", type=Path, metavar="FILE", help="JUnit XML for CI")
+    files.add_argument(
+        "--html", type=Path, metavar="FILE", help="one page with all failing inputs; `conformance report` joins several results"
+    )
+    files.add_argument("--badge", type=Path, metavar="FILE", help="an SVG for a README")
 
 
 def main(console: Console, options: argparse.Namespace) -> int:
     checks = selected_checks(options.dtype, options.only)
     if not checks:
         raise UserError(f"no check matches --only {options.only!r}")
-    results: list[Result] = []
-    with (
-        candidate(options.candidate, options.process, options.dtype, options.device, options.timeout) as adapter,
-        console.status("checking") as status,
-    ):
-        options.candidate = options.candidate or options.process
+    expected = read_expected(options.expect) if options.expect else ExpectedFailures()
+    settings = Settings(
+        candidate=options.candidate or options.process or "",
+        process=options.process is not None,
+        **{name: getattr(options, name) for name in ("dtype", "device", "profile", "only", "seed", "examples", "at_least")},
+    )
+    with candidate(options.candidate, options.process, options.dtype, options.device, options.timeout) as adapter:
         for remark in remarks(adapter):
             console.print(remark, markup=False, highlight=False)
+        implementation = identity(adapter, settings)
+        results = list(_run_all(console, checks, adapter, settings))
+        data = result_data(settings, implementation, results, expected)
+    terminal.show(console, data)
+    if options.json:
+        write(options.json, data)
+    for name, render in RENDERED.items():
+        if path := getattr(options, name):
+            write_text(path, render(data))
+    return 0 if data["verdict"]["passed"] else 1
+
+
+def _run_all(console: Console, checks: list[Check], adapter: object, settings: Settings) -> Iterable[Result]:
+    with console.status("checking") as status:
         for number, check in enumerate(checks, 1):
             status.update(f"{number}/{len(checks)} {check.name}")
-            results.append(run_check(check, adapter, options.dtype, options.profile, options.seed, options.examples))
-    _print_results(console, results, options)
-    if options.json:
-        write(options.json, run_report(results, options))
-    return 0 if all(result.status in ("pass", "not offered") for result in results) and any(r.status == "pass" for r in results) else 1
-
-
-def _print_results(console: Console, results: list[Result], options: argparse.Namespace) -> None:
-    table = Table(title=f"{options.candidate}, {options.dtype}, profile {options.profile}, seed {options.seed}", title_justify="left")
-    for column in ("requirement", "checks", "worst deviation", "of allowed", "where", "result"):
-        table.add_column(column, overflow="fold")
-    for row in rows(results):
-        worst = row.worst
-        table.add_row(
-            row.requirement,
-            str(len(row.results)),
-            f"{worst.deviation:.1e}",
-            f"{worst.share:.0%}" if worst.share < 1e6 else "-",
-            worst.where,
-            f"[{STYLE[row.status]}]{row.status}",
-        )
-    console.print(table)
-    for result in results:
-        if result.status in ("fail", "error"):
-            console.print(f"[bold red]{result.check.name}[/] ({', '.join(result.check.requirements)}): {result.check.summary}")
-            console.print(result.message, markup=False, highlight=False)
-    counts = Counter(result.status for result in results)
-    numbers = sum(result.compared for result in results)
-    console.print(f"{len(results)} checks, {numbers:,} numbers compared: " + ", ".join(f"{counts[name]} {name}" for name in STYLE))
-
-
-def run_report(results: list[Result], options: argparse.Namespace) -> dict[str, Any]:
-    """A run in plain JSON types: what was run, and what was found for each check and for each requirement.
-
-    `share` is the worst deviation as a share of the allowed one; it is null where what failed has no size.
-    """
-    settings = {name: getattr(options, name) for name in ("candidate", "dtype", "device", "profile", "only", "seed", "examples")}
-    checks = {result.check.name: {"status": result.status, "compared": result.compared, "message": result.message} for result in results}
-    found = {
-        row.requirement: {
-            "status": row.status,
-            "checks": [result.check.name for result in row.results],
-            "deviation": finite(row.worst.deviation),
-            "share": finite(row.worst.share),
-            "where": row.worst.where,
-        }
-        for row in rows(results)
-    }
-    return {**settings, "versions": versions(), "checks": checks, "requirements": found}
+            yield run_check(check, adapter, settings.dtype, settings.profile, settings.seed, settings.examples)

@@ -1,0 +1,91 @@
+"""The result as Markdown, for a comment or a page of a wiki."""
+
+import re
+from collections.abc import Iterable, Sequence
+
+from conformance.reports import summary
+from conformance.reports.summary import Data
+
+
+def render(data: Data) -> str:
+    parts = [
+        f"# Conformance of {text(summary.label(data))}",
+        f"**{text(summary.headline(data)).capitalize()}.**",
+        f"{text(summary.settings(data))}, {text(data['date'])}. {text(summary.tally(data))}.",
+        *_claim(data),
+        _chapters(data),
+        *_diagnoses(data),
+        *_expected(data),
+        *(part for name, check in summary.failures(data) for part in _failure(data, name, check)),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def text(plain: str) -> str:
+    """Plain text in which nothing is markup, in one line."""
+    return re.sub(r"([\\`*_{}\[\]<>|#!~$&])", r"\\\1", " ".join(plain.split()))
+
+
+def code(plain: str) -> str:
+    """Plain text as code in a line. It may hold backticks."""
+    if not plain.strip():
+        return ""
+    fence = "`" * (_longest_run(plain) + 1)
+    space = " " if plain.startswith("`") or plain.endswith("`") else ""
+    return f"{fence}{space}{' '.join(plain.split())}{space}{fence}"
+
+
+def block(plain: str, language: str = "") -> str:
+    fence = "`" * max(3, _longest_run(plain) + 1)
+    return f"{fence}{language}\n{plain.rstrip()}\n{fence}"
+
+
+def _longest_run(plain: str) -> int:
+    return max((len(run) for run in re.findall("`+", plain)), default=0)
+
+
+def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Cells are markup."""
+    return "\n".join("| " + " | ".join(cells) + " |" for cells in (header, ["---"] * len(header), *rows))
+
+
+def chapter(path: str) -> str:
+    address = summary.address(path)
+    return f"[{text(summary.title(path))}]({address})" if address else f"{text(summary.title(path))} ({code(path)})"
+
+
+def _claim(data: Data) -> list[str]:
+    edition = data["implementation"]["edition"]
+    return [f"It claims the edition {text(edition)}."] if edition else []
+
+
+def _chapters(data: Data) -> str:
+    rows = []
+    for found in summary.chapters(data):
+        counts = ", ".join(f"{found.counts[name]} {name}" for name in summary.STATUSES if found.counts[name])
+        rows.append([chapter(found.path), counts, summary.percent(found.share), text(found.where)])
+    return table(["chapter", "requirements", "worst, of allowed", "where"], rows)
+
+
+def _diagnoses(data: Data) -> list[str]:
+    lines = [
+        f"- **{text(found['mutant'])}**: {text(found['explanation'])} See {chapter(found['chapter'])}. {text(found['fix'])} "
+        f"Explains {', '.join(map(code, found['explained']))}."
+        for found in data["diagnoses"]
+    ]
+    return ["## It behaves like", "\n".join(lines)] if lines else []
+
+
+def _expected(data: Data) -> list[str]:
+    rows = [[code(entry["name"]), entry["outcome"], text(entry["reason"])] for entry in data["expected_failures"]]
+    return ["## Expected failures", table(["name", "outcome", "reason"], rows)] if rows else []
+
+
+def _failure(data: Data, name: str, check: Data) -> list[str]:
+    failure = check["failure"]
+    expected = f" An expected failure: {text(check['expected_failure'])}" if summary.is_expected(check) else ""
+    parts = [f"## {text(name)}", f"{', '.join(check['requirements'])}: {text(check['summary'])}{expected}", block(check["message"], "text")]
+    rows = [[code(value["name"]), text(value["type"]), code(value["text"]).replace("|", "\\|")] for value in summary.values(failure)]
+    if rows:
+        parts += [f"The call of {code(failure['function'])}:", table(["", "type", "value"], rows)]
+    return [*parts, block(failure["command"], "sh"), block(failure["snippet"], "python")]

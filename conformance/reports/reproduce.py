@@ -1,0 +1,74 @@
+"""What it takes to see one failure again: its inputs, a command line, and a few lines of Python."""
+
+import shlex
+from typing import Any
+
+from conformance.adapter import COLUMNS, INTERFACE, OBJECTS
+from conformance.check import Call
+from conformance.execute import Result, Settings
+from conformance.reports.values import WRITTEN_OUT, is_known, shown, size, source
+
+
+def failure(result: Result, settings: Settings) -> dict[str, Any]:
+    """The failing call in full as far as it is small, and how to repeat it; as the schema's `failure` says.
+
+    The call is the last one before the deviation: it has the smallest arguments that hypothesis finds.
+    """
+    call = result.call
+    found: dict[str, Any] = {"function": None, "arguments": [], "got": None, "expected": None}
+    if call is not None:
+        names = INTERFACE[call.function]
+        entries = [shown(name, value) for name, value in zip(names, call.arguments, strict=False)]
+        found = {"function": call.function, "arguments": [entry for group in entries for entry in group], "got": None, "expected": None}
+        if call.got is not None and call.expected is not None:
+            found["got"], found["expected"] = shown("got", call.got, call.index)[0], shown("expected", call.expected, call.index)[0]
+    return {**found, "command": command(result.check.name, settings), "snippet": snippet(result.check.name, call, settings)}
+
+
+def command(name: str, settings: Settings) -> str:
+    """The command line that runs this check alone, on the same cases."""
+    words = ["conformance", "check", *(["--process"] if settings.process else []), settings.candidate]
+    words += ["--dtype", settings.dtype, *(["--device", settings.device] if settings.device else []), "--profile", settings.profile]
+    return shlex.join([*words, "--only", name, "--seed", str(settings.seed), "--examples", str(settings.examples)])
+
+
+def snippet(name: str, call: Call | None, settings: Settings) -> str:
+    """Python that makes the failing call again.
+
+    Arguments of up to WRITTEN_OUT numbers are written out. Larger ones are made anew by running the check; so is a call that makes an
+    object, which fails in one of its methods.
+    """
+    adapter = _adapter(settings)
+    is_written = call is not None and call.function not in OBJECTS and size(call.arguments) <= WRITTEN_OUT and is_known(call.arguments)
+    if call is not None and is_written:
+        names = INTERFACE[call.function]
+        arguments = [(name, source(value)) for name, value in zip(names, call.arguments, strict=True)]
+        spec = [word for word in ("Discrete", "Image", "Parameter", "Spaces", "Vector", "load_config") if f"{word}(" in str(arguments)]
+        lines = ["import numpy as np", "", adapter[0], *([f"from spec import {', '.join(spec)}"] if spec else []), "", adapter[1]]
+        lines += [f"{name} = {text}" for name, text in arguments]
+        return "\n".join([*lines, f"print(adapter.{call.function}({', '.join(names)}))"])
+    options = f"{settings.dtype!r}, {settings.profile!r}, seed={settings.seed}, examples={settings.examples}"
+    lines = [
+        "import conformance.cases",
+        adapter[0],
+        "from conformance.check import CHECKS",
+        "from conformance.execute import run_check",
+        "",
+    ]
+    lines += [adapter[1], f"result = run_check(CHECKS[{name!r}], adapter, {options})", "print(result.message)"]
+    if call is not None and call.function not in OBJECTS:
+        lines += [f"print(adapter.{call.function}(*result.call.arguments))"]
+        lines += ["print(result.call.expected)"] if call.expected is not None else []
+    return "\n".join(lines)
+
+
+def _adapter(settings: Settings) -> tuple[str, str]:
+    """Two lines: the import, and the adapter."""
+    if settings.process:
+        made = f"ProcessAdapter({settings.candidate!r}, {settings.dtype!r}, timeout=120)"
+        return "from conformance.process import ProcessAdapter", f"adapter = {made}"
+    device = f", {settings.device!r}" if settings.device and settings.candidate in COLUMNS else ""
+    return (
+        "from conformance.candidate import load_candidate",
+        f"adapter = load_candidate({settings.candidate!r}, {settings.dtype!r}{device})",
+    )
