@@ -1,0 +1,281 @@
+"""From deviations to the mistake: which mutant gives the numbers of the candidate where the checks fail.
+
+A failing check is run again on the candidate with a note of every call and its result: its trace. The same check is run on each mutant
+that it reaches. A mutant explains the check if its results agree with the trace, also where those of the reference do not.
+"""
+
+import copy
+import dataclasses
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from conformance.adapters.numpy_adapter import NumpyAdapter
+from conformance.check import CHECKS, Check, Deviation, Run
+from conformance.execute import Result, missing, run_check
+from conformance.mutants import MUTANTS, Mutant, MutantAdapter
+from conformance.mutants.trial import on_the_reference
+
+# Agreement with a trace, relative to the largest number of an array, where the check itself does not say what it allows.
+AGREEMENT = {"float64": 1e-9, "float32": 1e-3, "bfloat16": 0.1}
+DERIVATIVES = {"float64": 1e-5, "float32": 1e-2, "bfloat16": 0.1}  # those of the reference are differences
+TRACE_LENGTH = 5000
+TRIES = 8  # so many checks, the most elementary first, are compared with every mutant in vain before the rest is left unexplained
+VALUES = "agent.losses_match"
+
+
+@dataclasses.dataclass(frozen=True)
+class Diagnosis:
+    """The candidate behaves like a mutant.
+
+    explained: names of the failing checks in which its results are those of the mutant. unexplained: of the other failing checks that
+    can be compared. alternatives: mutants that explain the same checks and cannot be told apart by any other.
+    """
+
+    mutant: Mutant
+    explained: tuple[str, ...]
+    unexplained: tuple[str, ...]
+    alternatives: tuple[Mutant, ...] = ()
+
+
+def diagnose(adapter: object, results: Iterable[Result], dtype: str, profile: str, seed: int = 0, examples: int = 25) -> list[Diagnosis]:
+    """The mistakes that explain why checks fail, those that explain most first; each explains a check that none before it does.
+
+    Args:
+      adapter: the candidate.
+      results: of all checks that were run on it, with the settings that follow.
+    """
+    results = list(results)
+    patient = _Patient(adapter, (dtype, profile, seed, examples), {result.check.name: result.status for result in results})
+    failing = [result.check for result in results if result.status in ("fail", "error")]
+    evidence = {check: trace for check in failing if (trace := patient.trace(check))}
+    found = _suspects(patient, evidence)
+    explained = {mutant: frozenset(check for check, trace in evidence.items() if patient.explains(mutant, check, trace)) for mutant in found}
+    passing = [result.check for result in results if result.status == "pass"]
+    diagnoses: list[Diagnosis] = []
+    open_ = set(evidence)
+    while explained := {mutant: checks for mutant, checks in explained.items() if checks & open_}:
+        most = max(len(checks) for checks in explained.values())
+        tied = [mutant for mutant, checks in explained.items() if len(checks) == most]
+        if len(tied) > 1:
+            tied = [mutant for mutant in tied if not patient.contradicts(mutant, passing)] or tied
+        first, *others = tied
+        alternatives = [mutant for mutant in others if explained[mutant] == explained[first]]
+        names = [(check.name, check in explained[first]) for check in evidence]
+        known, unknown = (tuple(name for name, is_known in names if is_known is wanted) for wanted in (True, False))
+        diagnoses.append(Diagnosis(first, known, unknown, tuple(alternatives)))
+        open_ -= explained[first]
+    return diagnoses
+
+
+def describe(diagnosis: Diagnosis) -> str:
+    """What the report says: "behaves like ...", with the chapter and the fix, in a few lines of plain text."""
+    mutant, count = diagnosis.mutant, len(diagnosis.explained)
+    lines = [
+        f"behaves like {mutant.name}: {mutant.explanation} ({mutant.provenance})",
+        f"  see {mutant.chapter}, {', '.join(mutant.violates)}. {mutant.fix}",
+        f"  explains {count} of {count + len(diagnosis.unexplained)} failing checks that mutants can be compared in",
+    ]
+    if diagnosis.alternatives:
+        lines.append(f"  cannot be told from {', '.join(other.name for other in diagnosis.alternatives)}")
+    return "\n".join(lines)
+
+
+def _suspects(patient: "_Patient", evidence: dict[Check, "_Trace"]) -> list[Mutant]:
+    """The mutants that explain a failing check. A check that one of them explains is not searched for others."""
+    found: list[Mutant] = []
+    tries = 0
+    for check, trace in sorted(evidence.items(), key=lambda item: (item[0].level, "loss_derivatives" in item[0].uses, item[0].name)):
+        if any(patient.explains(mutant, check, trace) for mutant in found):
+            continue
+        if new := [mutant for mutant in MUTANTS.values() if patient.explains(mutant, check, trace)]:
+            found += new
+        elif (tries := tries + 1) == TRIES:
+            break
+    return found
+
+
+@dataclasses.dataclass
+class _Call:
+    """One call and what came of it: a result, or the name of an exception's class. how: what the check allows."""
+
+    function: str
+    result: Any = None
+    raised: str | None = None
+    how: dict[str, Any] | None = None
+
+
+_Trace = list[_Call]
+
+
+class _Patient:
+    """A candidate and what is known of it, for one dtype, profile, seed and number of examples."""
+
+    def __init__(self, adapter: object, settings: tuple[str, str, int, int], statuses: dict[str, str]) -> None:
+        self.adapter, self.settings, self.statuses = adapter, settings, statuses
+        self._known: dict[tuple[str, str], bool] = {}
+
+    def trace(self, check: Check) -> _Trace | None:
+        """The calls of a check. None if the reference cannot make them, or makes them with the same results."""
+        if missing(NumpyAdapter(), check):
+            return None
+        run = _Recorder(self.adapter, *self.settings)
+        _complete(check, run)
+        return None if self._follows(NumpyAdapter(), check, run.calls) else run.calls
+
+    def explains(self, mutant: Mutant, check: Check, trace: _Trace) -> bool:
+        key = (mutant.name, check.name)
+        if key not in self._known:
+            _, entered = on_the_reference(check, *self.settings)
+            # What changes a loss is not the mistake of a candidate whose losses are right: derivatives take long, losses do not.
+            values_differ = self.statuses.get(VALUES) == "pass" and "loss_derivatives" in check.uses and self._changes_values(mutant)
+            self._known[key] = (
+                not entered.isdisjoint(mutant.edits) and not values_differ and self._follows(MutantAdapter(mutant), check, trace)
+            )
+        return self._known[key]
+
+    def contradicts(self, mutant: Mutant, passing: list[Check]) -> bool:
+        """Whether a check that the candidate passes fails on the mutant."""
+        rows = {target.partition(".")[0] for target in mutant.edits}
+        return any(self._fails(mutant, check) for check in sorted(passing, key=lambda check: check.name.partition(".")[0] not in rows))
+
+    def _changes_values(self, mutant: Mutant) -> bool:
+        return self._fails(mutant, CHECKS[VALUES])
+
+    def _fails(self, mutant: Mutant, check: Check) -> bool:
+        key = (mutant.name, f"fails {check.name}")
+        if key not in self._known:
+            _, entered = on_the_reference(check, *self.settings)
+            self._known[key] = not entered.isdisjoint(mutant.edits) and run_check(
+                check, MutantAdapter(mutant), *self.settings, shrink=False
+            ).status in ("fail", "error")
+        return self._known[key]
+
+    def _follows(self, adapter: object, check: Check, trace: _Trace) -> bool:
+        run = _Follower(adapter, *self.settings, trace)
+        _complete(check, run)
+        return run.agrees
+
+
+class _Recorder(Run):
+    """A run that notes every call, those of objects that the candidate makes included."""
+
+    def __init__(self, adapter: object, dtype: str, profile: str, seed: int, examples: int) -> None:
+        super().__init__(adapter, dtype, profile, seed, examples, shrink=False)
+        self.calls: _Trace = []
+
+    def call(self, function: str, *args: Any) -> Any:
+        made = self.noted(function, getattr(self.adapter, function), *args)
+        return _Object(self, made) if isinstance(getattr(NumpyAdapter(), function, None), type) else made
+
+    def expect(self, function: str, args: tuple[Any, ...], expected: Any, **how: Any) -> Any:
+        before = len(self.calls)
+        actual = self.call(function, *args)
+        if len(self.calls) > before:
+            self.calls[-1].how = how
+        self.compare(function, actual, expected, **how)
+        return actual
+
+    def noted(self, name: str, function: Any, *args: Any, **options: Any) -> Any:
+        entry = _Call(name)
+        try:
+            result = function(*args, **options)
+        except Exception as error:
+            entry.raised = type(error).__name__
+            raise
+        else:
+            entry.result = copy.deepcopy(result) if _is_data(result) else None
+        finally:
+            self.note(entry)
+        return result
+
+    def note(self, entry: _Call) -> None:
+        if len(self.calls) < TRACE_LENGTH:
+            self.calls.append(entry)
+
+
+class _Follower(_Recorder):
+    """A run that compares every call with the same call of a trace, and ends at the first that differs."""
+
+    def __init__(self, adapter: object, dtype: str, profile: str, seed: int, examples: int, trace: _Trace) -> None:
+        super().__init__(adapter, dtype, profile, seed, examples)
+        self.trace = trace
+        self.differs = False
+
+    @property
+    def agrees(self) -> bool:
+        return not self.differs and len(self.calls) >= min(len(self.trace), TRACE_LENGTH)
+
+    def note(self, entry: _Call) -> None:
+        super().note(entry)
+        position = len(self.calls) - 1
+        if not self.differs and position < len(self.trace):
+            self.differs = not self._same(entry, self.trace[position])
+        if self.differs:
+            raise Deviation("another result than in the trace")
+
+    def _same(self, entry: _Call, noted: _Call) -> bool:
+        if (entry.function, entry.raised) != (noted.function, noted.raised):
+            return False
+        ruler = Run(None, self.dtype, self.profile)
+        bounds = DERIVATIVES if entry.function == "loss_derivatives" else AGREEMENT
+        try:
+            if noted.how is None:
+                return _agree(ruler, entry.result, noted.result, bounds[self.dtype])
+            # Both may err by what the check allows.
+            ruler.compare("", entry.result, noted.result, **{**noted.how, "factor": 2 * noted.how.get("factor", 1.0)})
+        except Exception:  # whatever a candidate may return where numbers are expected
+            return False
+        return True
+
+
+class _Object:
+    """Something with methods that the candidate made. Its calls are noted, too."""
+
+    def __init__(self, run: _Recorder, made: Any) -> None:
+        self._run, self._made = run, made
+
+    def __getattr__(self, name: str) -> Any:
+        method = getattr(self._made, name)
+
+        def call(*args: Any, **options: Any) -> Any:
+            return self._run.noted(name, method, *args, **options)
+
+        call.__name__ = name
+        return call
+
+    def __call__(self, *args: Any) -> Any:
+        return self._run.noted("__call__", self._made, *args)
+
+    def __len__(self) -> int:
+        return int(self._run.noted("__len__", self._made.__len__))
+
+
+def _complete(check: Check, run: Run) -> None:
+    """Runs the check to its end or to its first deviation; what the candidate raises ends it, too."""
+    try:
+        check.body(run)
+    except Exception:
+        return
+
+
+def _is_data(result: Any) -> bool:
+    """Whether a result can be compared as it is. Objects are compared by what their methods return."""
+    if isinstance(result, Mapping):
+        return all(map(_is_data, result.values()))
+    if isinstance(result, tuple | list):
+        return all(map(_is_data, result))
+    return result is None or isinstance(result, str | bool | int | float | np.ndarray | np.generic)
+
+
+def _agree(ruler: Run, result: Any, noted: Any, bound: float) -> bool:
+    """Whether two results have the same numbers within the bound, and are equal otherwise."""
+    if isinstance(noted, Mapping):
+        return set(result) == set(noted) and all(_agree(ruler, result[key], noted[key], bound) for key in noted)
+    if isinstance(noted, tuple | list):
+        return len(result) == len(noted) and all(_agree(ruler, *pair, bound) for pair in zip(result, noted, strict=True))
+    if noted is None or isinstance(noted, str):
+        return bool(result == noted)
+    ruler.compare("", result, noted, magnitude="tensor", bound=bound)
+    return True
