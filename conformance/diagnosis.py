@@ -13,9 +13,9 @@ import numpy as np
 
 from conformance.adapters.numpy_adapter import NumpyAdapter
 from conformance.check import CHECKS, Check, Deviation, Run
-from conformance.execute import Result, missing, run_check
+from conformance.execute import Result, finish, missing
 from conformance.mutants import MUTANTS, Mutant, MutantAdapter
-from conformance.mutants.trial import on_the_reference
+from conformance.mutants.trial import on_the_mutant, on_the_reference
 
 # Agreement with a trace, relative to the largest number of an array, where the check itself does not say what it allows.
 AGREEMENT = {"float64": 1e-9, "float32": 1e-3, "bfloat16": 0.1}
@@ -49,9 +49,10 @@ def diagnose(adapter: object, results: Iterable[Result], dtype: str, profile: st
     results = list(results)
     patient = _Patient(adapter, (dtype, profile, seed, examples), {result.check.name: result.status for result in results})
     failing = [result.check for result in results if result.status in ("fail", "error")]
+    failing.sort(key=lambda check: (check.level, _of_derivatives(check), patient.size(check), check.name))
     evidence = {check: trace for check in failing if (trace := patient.trace(check))}
     found = _suspects(patient, evidence)
-    explained = {mutant: frozenset(check for check, trace in evidence.items() if patient.explains(mutant, check, trace)) for mutant in found}
+    explained = {mutant: {check for check, trace in evidence.items() if patient.explains(mutant, check, trace)} for mutant in found}
     passing = [result.check for result in results if result.status == "pass"]
     diagnoses: list[Diagnosis] = []
     open_ = set(evidence)
@@ -86,7 +87,7 @@ def _suspects(patient: "_Patient", evidence: dict[Check, "_Trace"]) -> list[Muta
     """The mutants that explain a failing check. A check that one of them explains is not searched for others."""
     found: list[Mutant] = []
     tries = 0
-    for check, trace in sorted(evidence.items(), key=lambda item: (item[0].level, "loss_derivatives" in item[0].uses, item[0].name)):
+    for check, trace in evidence.items():
         if any(patient.explains(mutant, check, trace) for mutant in found):
             continue
         if new := [mutant for mutant in MUTANTS.values() if patient.explains(mutant, check, trace)]:
@@ -114,47 +115,48 @@ class _Patient:
 
     def __init__(self, adapter: object, settings: tuple[str, str, int, int], statuses: dict[str, str]) -> None:
         self.adapter, self.settings, self.statuses = adapter, settings, statuses
-        self._known: dict[tuple[str, str], bool] = {}
+        self._explained: dict[tuple[str, str], bool] = {}
+
+    def size(self, check: Check) -> int:
+        """How many numbers it compares."""
+        return on_the_reference(check, *self.settings)[0].compared
 
     def trace(self, check: Check) -> _Trace | None:
-        """The calls of a check. None if the reference cannot make them, or makes them with the same results."""
-        if missing(NumpyAdapter(), check):
+        """The calls of a check. None if the reference cannot make them, or makes them with the same results.
+
+        Derivatives are compared where the losses are right: those of other losses are wrong anyway.
+        """
+        if missing(NumpyAdapter(), check) or (_of_derivatives(check) and self.statuses.get(VALUES) in ("fail", "error")):
             return None
         run = _Recorder(self.adapter, *self.settings)
-        _complete(check, run)
+        finish(check, run)
         return None if self._follows(NumpyAdapter(), check, run.calls) else run.calls
 
     def explains(self, mutant: Mutant, check: Check, trace: _Trace) -> bool:
         key = (mutant.name, check.name)
-        if key not in self._known:
-            _, entered = on_the_reference(check, *self.settings)
-            # What changes a loss is not the mistake of a candidate whose losses are right: derivatives take long, losses do not.
-            values_differ = self.statuses.get(VALUES) == "pass" and "loss_derivatives" in check.uses and self._changes_values(mutant)
-            self._known[key] = (
-                not entered.isdisjoint(mutant.edits) and not values_differ and self._follows(MutantAdapter(mutant), check, trace)
-            )
-        return self._known[key]
+        if key not in self._explained:
+            self._explained[key] = self._may_explain(mutant, check) and self._follows(MutantAdapter(mutant), check, trace)
+        return self._explained[key]
 
     def contradicts(self, mutant: Mutant, passing: list[Check]) -> bool:
         """Whether a check that the candidate passes fails on the mutant."""
         rows = {target.partition(".")[0] for target in mutant.edits}
         return any(self._fails(mutant, check) for check in sorted(passing, key=lambda check: check.name.partition(".")[0] not in rows))
 
-    def _changes_values(self, mutant: Mutant) -> bool:
-        return self._fails(mutant, CHECKS[VALUES])
+    def _may_explain(self, mutant: Mutant, check: Check) -> bool:
+        """What changes a loss is not the mistake of a candidate whose losses are right. This is said fast, derivatives are slow."""
+        right = _of_derivatives(check) and self.statuses.get(VALUES) == "pass"
+        return self._reaches(mutant, check) and not (right and self._fails(mutant, CHECKS[VALUES]))
 
     def _fails(self, mutant: Mutant, check: Check) -> bool:
-        key = (mutant.name, f"fails {check.name}")
-        if key not in self._known:
-            _, entered = on_the_reference(check, *self.settings)
-            self._known[key] = not entered.isdisjoint(mutant.edits) and run_check(
-                check, MutantAdapter(mutant), *self.settings, shrink=False
-            ).status in ("fail", "error")
-        return self._known[key]
+        return self._reaches(mutant, check) and on_the_mutant(mutant, check, *self.settings).status in ("fail", "error")
+
+    def _reaches(self, mutant: Mutant, check: Check) -> bool:
+        return not on_the_reference(check, *self.settings)[1].isdisjoint(mutant.edits)
 
     def _follows(self, adapter: object, check: Check, trace: _Trace) -> bool:
         run = _Follower(adapter, *self.settings, trace)
-        _complete(check, run)
+        finish(check, run)
         return run.agrees
 
 
@@ -252,12 +254,8 @@ class _Object:
         return int(self._run.noted("__len__", self._made.__len__))
 
 
-def _complete(check: Check, run: Run) -> None:
-    """Runs the check to its end or to its first deviation; what the candidate raises ends it, too."""
-    try:
-        check.body(run)
-    except Exception:
-        return
+def _of_derivatives(check: Check) -> bool:
+    return "loss_derivatives" in check.uses
 
 
 def _is_data(result: Any) -> bool:

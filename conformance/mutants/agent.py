@@ -56,11 +56,7 @@ MUTANTS = (
         provenance="TorchRL's collector until issue 4119",
         violates=("AGT-11",),
         fix="Give the encoder's tokens to the posterior when acting.",
-        edits={
-            "agent.policy_step": {
-                "tokens = networks.encoder(params, observation, spaces, config)": "tokens = 0.0 * networks.encoder(params, observation, spaces, config)"
-            }
-        },
+        edits={"agent.policy_step": {"tokens = networks.encoder(": "tokens = 0.0 * networks.encoder("}},
     ),
     Mutant(
         name="policy_ignores_resets",
@@ -86,7 +82,8 @@ MUTANTS = (
         fix="Start from the latents that are stored with the context step.",
         edits={
             "agent.losses": {
-                '{"deter": stop_gradient(batch["deter"]), "stoch": stop_gradient(context)}': '{"deter": stop_gradient(0.0 * np.asarray(batch["deter"])), "stoch": stop_gradient(0.0 * context)}'
+                'stop_gradient(batch["deter"])': 'stop_gradient(np.zeros(np.shape(batch["deter"])))',
+                "stop_gradient(context)": "stop_gradient(0.0 * context)",
             }
         },
     ),
@@ -125,11 +122,7 @@ MUTANTS = (
         provenance="plausible: [T, B] in one place and [B, T] in another",
         violates=("CON-2", "AGT-20"),
         fix="Flatten everything as [B, T].",
-        edits={
-            "agent.losses": {
-                'continue_target(batch["is_terminal"], config).reshape(starts, 1)': 'continue_target(batch["is_terminal"], config).T.reshape(starts, 1)'
-            }
-        },
+        edits={"agent.losses": {"config).reshape(starts, 1)": "config).T.reshape(starts, 1)"}},
     ),
     Mutant(
         name="return_range_one_step_late",
@@ -146,9 +139,7 @@ MUTANTS = (
         violates=("BEH-11", "AGT-23"),
         fix="Score the action at the state where it was chosen.",
         edits={
-            "agent.losses": {
-                "outputs = networks.actor(params, acting, spaces, config)": "outputs = networks.actor(params, features[:, 1:], spaces, config)"
-            }
+            "agent.losses": {"networks.actor(params, acting, spaces, config)": "networks.actor(params, features[:, 1:], spaces, config)"}
         },
     ),
     Mutant(
@@ -165,11 +156,7 @@ MUTANTS = (
         provenance="naivoder's implementation",
         violates=("AGT-24",),
         fix="Divide the advantages of the actor alone.",
-        edits={
-            "agent.losses": {
-                "critic_loss(logits, slow_logits, returns, weight, config)\n": "critic_loss(logits, slow_logits, returns / scale, weight, config)\n"
-            }
-        },
+        edits={"agent.losses": {"slow_logits, returns, weight, config)": "slow_logits, returns / scale, weight, config)"}},
     ),
     Mutant(
         name="replayed_return_from_the_critic",
@@ -193,11 +180,7 @@ MUTANTS = (
         provenance="plausible: the paper does not say where it ends (D-32)",
         violates=("BEH-15", "AGT-28"),
         fix="Let the critic read replayed states with their gradient.",
-        edits={
-            "agent.losses": {
-                'replayed = networks.feature(states["deter"], states["stoch"])[:, :-1]': 'replayed = stop_gradient(networks.feature(states["deter"], states["stoch"]))[:, :-1]'
-            }
-        },
+        edits={"agent.losses": {"networks.critic(params, replayed, config)": "networks.critic(params, stop_gradient(replayed), config)"}},
     ),
     Mutant(
         name="slow_target_moves_the_model",
@@ -259,11 +242,7 @@ MUTANTS = (
         provenance="r2dreamer, NM512/dreamerv3-torch and sheeprl (D-52)",
         violates=("BEH-21", "AGT-29"),
         fix="Update the slow critic after the optimizer step, from the new parameters.",
-        edits={
-            "agent.train_step": {
-                'update_slow_critic(state["slow_critic"], params, config.slow_critic_decay)': 'update_slow_critic(state["slow_critic"], state["params"], config.slow_critic_decay)'
-            }
-        },
+        edits={"agent.train_step": {"params, config.slow_critic_decay)": 'state["params"], config.slow_critic_decay)'}},
     ),
     Mutant(
         name="slow_critic_updated_too_rarely",
@@ -273,9 +252,7 @@ MUTANTS = (
         fix="Update the slow critic in every train step.",
         edits={
             "agent.train_step": {
-                '"slow_critic": update_slow_critic(state["slow_critic"], params, config.slow_critic_decay)': (
-                    '"slow_critic": update_slow_critic(state["slow_critic"], params, 1.0 if optimizer["step"] % 32 else config.slow_critic_decay)'
-                )
+                "params, config.slow_critic_decay)": 'params, 1.0 if optimizer["step"] % 32 else config.slow_critic_decay)'
             }
         },
     ),

@@ -38,13 +38,13 @@ MUTANTS = (
         fix="Sample every latent and action.",
         edits={
             "distributions.categorical_sample": {
-                "np.sum(cumulative[..., :-1] <= uniform[..., None], axis=-1)": "np.argmax(log_probs, axis=-1) + 0 * cumulative[..., 0].astype(int)"
+                "np.sum(cumulative[..., :-1] <= uniform[..., None], axis=-1)": "np.argmax(log_probs, axis=-1)"
             }
         },
     ),
     Mutant(
         name="impossible_class_is_drawn",
-        explanation="a uniform number that equals a cumulative probability counts as below it, so that 0 draws a first class of probability 0",
+        explanation="a uniform number of 0 draws a first class of probability 0",
         provenance="plausible: < in place of <=",
         violates=("DIS-8",),
         fix="Count the cumulative probabilities that are smaller than or equal to the uniform number.",
@@ -136,7 +136,7 @@ MUTANTS = (
         fix="Use the sigmoid of the logit.",
         edits={
             "distributions.bernoulli_mean": {
-                'return _sigmoid(checked("logit", logit, ...))': 'p = _sigmoid(checked("logit", logit, ...))\n    return np.where(np.isnan(p), p, p > 0.5)'
+                'return _sigmoid(checked("logit", logit, ...))': "return np.where(np.isnan(logit), np.nan, np.asarray(logit) > 0.0)"
             }
         },
     ),

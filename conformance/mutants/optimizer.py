@@ -15,8 +15,9 @@ MUTANTS = (
             "optimizer.adaptive_gradient_clip": {
                 "length, size = _norm(gradient), _norm(parameter)": (
                     "if gradient.ndim > 1:\n"
-                    "        pairs = zip(np.moveaxis(gradient, -1, 0), np.moveaxis(parameter, -1, 0), strict=True)\n"
-                    "        return np.stack([adaptive_gradient_clip(*pair, clip, epsilon).reshape(gradient.shape[:-1]) for pair in pairs], -1)\n"
+                    "        units = zip(np.moveaxis(gradient, -1, 0), np.moveaxis(parameter, -1, 0), strict=True)\n"
+                    "        clipped = [adaptive_gradient_clip(g.ravel(), p.ravel(), clip, epsilon).reshape(g.shape) for g, p in units]\n"
+                    "        return np.stack(clipped, -1)\n"
                     "    length, size = _norm(gradient), _norm(parameter)"
                 )
             }
@@ -63,7 +64,7 @@ MUTANTS = (
         edits={
             "optimizer.optimizer_step": {
                 "clipped, state[": "gradients[name], state[",
-                "new_params[name] = ": "update = adaptive_gradient_clip(update, params[name], config.agc_clip, config.agc_epsilon)\n        new_params[name] = ",
+                "- rate * update": f"- rate * {_CLIP.replace('gradients[name]', 'update')}",
             }
         },
     ),
@@ -92,7 +93,7 @@ MUTANTS = (
         edits={
             "optimizer.laprop": {
                 "normalized = np.where(gradient == 0, 0.0, gradient / np.where(gradient == 0, 1.0, root))": "normalized = gradient",
-                "update = momentum / (1 - config.beta1**updates)": "update = momentum / (1 - config.beta1**updates) / np.where(root == 0, 1.0, root)",
+                "(1 - config.beta1**updates)": "(1 - config.beta1**updates) / np.where(root == 0, 1.0, root)",
             }
         },
     ),

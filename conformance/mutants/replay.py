@@ -119,11 +119,7 @@ MUTANTS = (
         provenance="2023 edition, NM512/dreamerv3-torch and sheeprl (D-85)",
         violates=("REP-17",),
         fix="Give the stored flag.",
-        edits={
-            "replay.Replay": {
-                "        return batch\n\n    def write_back": '        batch["is_first"][:, 0] = True\n        return batch\n\n    def write_back'
-            }
-        },
+        edits={"replay.Replay": {"        return batch\n": '        batch["is_first"][:, 0] = True\n        return batch\n'}},
     ),
     Mutant(
         name="latents_written_one_step_early",

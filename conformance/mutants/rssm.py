@@ -9,11 +9,7 @@ MUTANTS = (
         provenance="plausible",
         violates=("RSSM-1", "CON-3"),
         fix="Flatten [S, C] row by row: class c of latent s is entry s C + c.",
-        edits={
-            "rssm.core": {
-                "stoch.reshape(*rows, config.stoch * config.classes)": "np.swapaxes(stoch, -1, -2).reshape(*rows, config.stoch * config.classes)"
-            }
-        },
+        edits={"rssm.core": {"flat_stoch = stoch.reshape(": "flat_stoch = np.swapaxes(stoch, -1, -2).reshape("}},
     ),
     Mutant(
         name="actions_enter_unbounded",
@@ -106,11 +102,7 @@ MUTANTS = (
         provenance="NM512/dreamerv3-torch until commit 308eeff (pull request 14); navix and TorchRL until compared with a reference",
         violates=("RSSM-13",),
         fix="Where is_first, replace memory, latents and previous action by zeros before the core.",
-        edits={
-            "rssm.observe_step": {
-                'require_shape("is_first", is_first.shape, "N")': 'require_shape("is_first", is_first.shape, "N")\n    is_first = np.zeros_like(is_first)'
-            }
-        },
+        edits={"rssm.observe_step": {"is_first = np.asarray(is_first, dtype=bool)": "is_first = np.zeros(np.shape(is_first), dtype=bool)"}},
     ),
     Mutant(
         name="reset_keeps_the_action",

@@ -45,8 +45,8 @@ MUTANTS = (
         fix="The nearer bin gets the larger weight: the distance to the other bin over their width.",
         edits={
             "transforms.twohot": {
-                "(bins[lower + 1] - number) / width": "(number - bins[lower]) / width + 0.0",
-                "weights[(*index, lower + 1)] = (number - bins[lower]) / width": "weights[(*index, lower + 1)] = (bins[lower + 1] - number) / width",
+                "weights[(*index, lower)] = (": "weights[(*index, lower + 1)] = (",
+                "weights[(*index, lower + 1)] = (number": "weights[(*index, lower)] = (number",
             }
         },
     ),

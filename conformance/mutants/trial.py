@@ -76,10 +76,16 @@ def relevant(mutant: Mutant, reach: Reach) -> list[Check]:
     )
 
 
+@functools.cache
+def on_the_mutant(mutant: Mutant, check: Check, dtype: str, profile: str, seed: int, examples: int) -> Result:
+    """What a check finds when the mutant is the candidate."""
+    return run_check(check, MutantAdapter(mutant), dtype, profile, seed, examples, shrink=False)
+
+
 def trial(mutant: Mutant, checks: Iterable[Check], examples: int = 5) -> Iterator[Result]:
-    """What the checks find when the mutant is the candidate."""
+    """What the checks find when the mutant is the candidate, one after the other."""
     for check in checks:
-        yield run_check(check, MutantAdapter(mutant), "float64", "paper", examples=examples, shrink=False)
+        yield on_the_mutant(mutant, check, "float64", "paper", 0, examples)
 
 
 def caught_by(mutant: Mutant, checks: Iterable[Check], examples: int = 5) -> dict[str, list[str]]:

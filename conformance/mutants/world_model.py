@@ -35,11 +35,7 @@ MUTANTS = (
         provenance="RLlib's Dreamer (issue 31009) and yusukeurakami's (issue 5)",
         violates=("WM-6", "CON-9"),
         fix="Learn the reward that arrived with the observation of the same step.",
-        edits={
-            "world_model.world_model_losses": {
-                'symexp_twohot_loss(reward_logits, batch["reward"], ': 'symexp_twohot_loss(reward_logits, np.roll(batch["reward"], 1, axis=1), '
-            }
-        },
+        edits={"world_model.world_model_losses": {'reward_logits, batch["reward"]': 'reward_logits, np.roll(batch["reward"], 1, axis=1)'}},
     ),
     Mutant(
         name="reward_by_squared_error",
@@ -205,8 +201,8 @@ MUTANTS = (
         fix="Stop the gradient at the posterior in the dynamics loss and at the prior in the representation loss.",
         edits={
             "world_model.kl_losses": {
-                "dynamics = categorical_kl(stop_gradient(posterior), prior)": "dynamics = categorical_kl(posterior, stop_gradient(prior))",
-                "representation = categorical_kl(posterior, stop_gradient(prior))": "representation = categorical_kl(stop_gradient(posterior), prior)",
+                f"dynamics = {_DYNAMICS}": f"dynamics = {_REPRESENTATION}",
+                f"representation = {_REPRESENTATION}": f"representation = {_DYNAMICS}",
             }
         },
     ),
@@ -226,9 +222,9 @@ MUTANTS = (
         fix="After the context draw the latents from the prior.",
         edits={
             "world_model.open_loop": {
-                "prior_noise = checked(": 'everything = np.concatenate([noise["posterior"], noise["prior"]], axis=1)\n    prior_noise = checked(',
                 "np.asarray(observation[key])[:, :context]": "np.asarray(observation[key])",
-                'prev_action[:, :context], is_first[:, :context], noise["posterior"], config)': "prev_action, is_first, everything, config)",
+                "prev_action[:, :context], is_first[:, :context]": "prev_action, is_first",
+                'noise["posterior"]': 'np.concatenate([noise["posterior"], prior_noise], axis=1)',
                 "for t in range(context, steps)": "for t in range(0)",
             }
         },
