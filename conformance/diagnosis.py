@@ -268,12 +268,18 @@ def _is_data(result: Any) -> bool:
 
 
 def _agree(ruler: Run, result: Any, noted: Any, bound: float) -> bool:
-    """Whether two results have the same numbers within the bound, and are equal otherwise."""
-    if isinstance(noted, Mapping):
-        return set(result) == set(noted) and all(_agree(ruler, result[key], noted[key], bound) for key in noted)
-    if isinstance(noted, tuple | list):
+    """Whether a result has the numbers of the noted one within the bound, and is equal otherwise. The noted one may hold more keys."""
+    if isinstance(result, Mapping):
+        if not set(result) <= set(noted):
+            return False
+        if all(isinstance(value, int | float | np.number | np.ndarray) and np.ndim(value) == 0 for value in result.values()):
+            # Numbers under one roof, such as losses: the large ones say how exact the small ones can be.
+            result, noted = np.array([*result.values()]), np.array([noted[key] for key in result])
+        else:
+            return all(_agree(ruler, result[key], noted[key], bound) for key in result)
+    if isinstance(result, tuple | list):
         return len(result) == len(noted) and all(_agree(ruler, *pair, bound) for pair in zip(result, noted, strict=True))
-    if noted is None or isinstance(noted, str):
+    if result is None or isinstance(result, str):
         return bool(result == noted)
     ruler.compare("", result, noted, magnitude="tensor", bound=bound)
     return True

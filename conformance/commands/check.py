@@ -10,6 +10,7 @@ from rich.table import Table
 
 from conformance.candidate import load_candidate
 from conformance.check import DTYPES
+from conformance.diagnosis import describe, diagnose
 from conformance.errors import UserError
 from conformance.execute import Result, rows, run_check, selected_checks
 from conformance.results import finite, versions, write
@@ -41,7 +42,11 @@ def main(console: Console, options: argparse.Namespace) -> int:
         for number, check in enumerate(checks, 1):
             status.update(f"{number}/{len(checks)} {check.name}")
             results.append(run_check(check, adapter, options.dtype, options.profile, options.seed, options.examples))
+        status.update("comparing with known mistakes")
+        diagnoses = diagnose(adapter, results, options.dtype, options.profile, options.seed, options.examples)
     _print_results(console, results, options)
+    for diagnosis in diagnoses:
+        console.print(describe(diagnosis), markup=False, highlight=False)
     if options.json:
         write(options.json, run_report(results, options))
     return 0 if all(result.status in ("pass", "not offered") for result in results) and any(r.status == "pass" for r in results) else 1

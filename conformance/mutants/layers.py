@@ -36,6 +36,14 @@ MUTANTS = (
         edits={"layers.rms_norm": {"mean_square + epsilon": "mean_square + 1e-6"}},
     ),
     Mutant(
+        name="activation_is_elu",
+        explanation="the activation is ELU",
+        provenance="DreamerV1 and V2",
+        violates=("LAY-5",),
+        fix="Use SiLU: x times its sigmoid.",
+        edits={"layers.silu": {"return x / (1.0 + np.exp(-x))": "return np.where(x > 0, x, np.expm1(np.minimum(x, 0.0)))"}},
+    ),
+    Mutant(
         name="kernel_flipped",
         explanation="the convolution flips its kernel",
         provenance="plausible: the mathematical convolution",
