@@ -47,26 +47,24 @@ def diagnose(adapter: object, results: Iterable[Result], dtype: str, profile: st
       results: of all checks that were run on it, with the settings that follow.
     """
     results = list(results)
-    patient = _Patient(adapter, (dtype, profile, seed, examples), {result.check.name: result.status for result in results})
+    candidate = _Candidate(adapter, (dtype, profile, seed, examples), {result.check.name: result.status for result in results})
     failing = [result.check for result in results if result.status in ("fail", "error")]
-    failing.sort(key=lambda check: (check.level, _of_derivatives(check), patient.size(check), check.name))
-    evidence = {check: trace for check in failing if (trace := patient.trace(check))}
-    found = _suspects(patient, evidence)
-    explained = {mutant: {check for check, trace in evidence.items() if patient.explains(mutant, check, trace)} for mutant in found}
+    failing.sort(key=lambda check: (check.level, _of_derivatives(check), candidate.size(check), check.name))
+    evidence = {check: trace for check in failing if (trace := candidate.trace(check))}
+    explained = {
+        mutant: {check for check, trace in evidence.items() if candidate.explains(mutant, check, trace)}
+        for mutant in _suspects(candidate, evidence)
+    }
     passing = [result.check for result in results if result.status == "pass"]
     diagnoses: list[Diagnosis] = []
-    open_ = set(evidence)
-    while explained := {mutant: checks for mutant, checks in explained.items() if checks & open_}:
-        most = max(len(checks) for checks in explained.values())
-        tied = [mutant for mutant, checks in explained.items() if len(checks) == most]
-        if len(tied) > 1:
-            tied = [mutant for mutant in tied if not patient.contradicts(mutant, passing)] or tied
-        first, *others = tied
-        alternatives = [mutant for mutant in others if explained[mutant] == explained[first]]
-        names = [(check.name, check in explained[first]) for check in evidence]
-        known, unknown = (tuple(name for name, is_known in names if is_known is wanted) for wanted in (True, False))
-        diagnoses.append(Diagnosis(first, known, unknown, tuple(alternatives)))
-        open_ -= explained[first]
+    left = set(evidence)
+    while explained := {mutant: checks for mutant, checks in explained.items() if checks & left}:
+        first, *others = _best(candidate, explained, passing)
+        known = tuple(check.name for check in evidence if check in explained[first])
+        unknown = tuple(check.name for check in evidence if check not in explained[first])
+        alternatives = tuple(mutant for mutant in others if explained[mutant] == explained[first])
+        diagnoses.append(Diagnosis(first, known, unknown, alternatives))
+        left -= explained[first]
     return diagnoses
 
 
@@ -83,18 +81,27 @@ def describe(diagnosis: Diagnosis) -> str:
     return "\n".join(lines)
 
 
-def _suspects(patient: "_Patient", evidence: dict[Check, "_Trace"]) -> list[Mutant]:
+def _suspects(candidate: "_Candidate", evidence: dict[Check, "_Trace"]) -> list[Mutant]:
     """The mutants that explain a failing check. A check that one of them explains is not searched for others."""
     found: list[Mutant] = []
     tries = 0
     for check, trace in evidence.items():
-        if any(patient.explains(mutant, check, trace) for mutant in found):
+        if any(candidate.explains(mutant, check, trace) for mutant in found):
             continue
-        if new := [mutant for mutant in MUTANTS.values() if patient.explains(mutant, check, trace)]:
+        if new := [mutant for mutant in MUTANTS.values() if candidate.explains(mutant, check, trace)]:
             found += new
         elif (tries := tries + 1) == TRIES:
             break
     return found
+
+
+def _best(candidate: "_Candidate", explained: dict[Mutant, set[Check]], passing: list[Check]) -> list[Mutant]:
+    """The mutants that explain most checks; of several, those that no passing check speaks against, if there are such."""
+    most = max(map(len, explained.values()))
+    tied = [mutant for mutant, checks in explained.items() if len(checks) == most]
+    if len(tied) == 1:
+        return tied
+    return [mutant for mutant in tied if not candidate.contradicts(mutant, passing)] or tied
 
 
 @dataclasses.dataclass
@@ -110,7 +117,7 @@ class _Call:
 _Trace = list[_Call]
 
 
-class _Patient:
+class _Candidate:
     """A candidate and what is known of it, for one dtype, profile, seed and number of examples."""
 
     def __init__(self, adapter: object, settings: tuple[str, str, int, int], statuses: dict[str, str]) -> None:

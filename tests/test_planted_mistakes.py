@@ -55,7 +55,7 @@ def test_chapters_of_requirements() -> None:
 
 
 def test_a_mistake_that_does_not_fit_the_source_is_an_error() -> None:
-    for text, count in (("np.arctan", 0), ("x", 15)):
+    for text, count in (("np.arctan", 0), ("np.", 4)):
         wrong = Mutant("wrong", "none", "none", ("LAY-5",), "none.", {"layers.silu": {text: "1"}})
         with pytest.raises(ValueError, match=f"mutant wrong: layers.silu holds {count} times '{text}'"):
             _ = wrong.replacements

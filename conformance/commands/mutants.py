@@ -68,7 +68,6 @@ def mutant_report(mutant: Mutant, results: Iterable[Result]) -> dict[str, Any]:
         "chapter": mutant.chapter,
         "violates": list(mutant.violates),
         "fix": mutant.fix,
-        "edits": {target: dict(edits) for target, edits in mutant.edits.items()},
         "deviates_in": [result.check.name for result in results if result.status == "fail"],
         "raises_in": [result.check.name for result in results if result.status == "error"],
     }
