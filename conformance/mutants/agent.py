@@ -125,6 +125,14 @@ MUTANTS = (
         edits={"agent.losses": {"config).reshape(starts, 1)": "config).T.reshape(starts, 1)"}},
     ),
     Mutant(
+        name="noise_repeats_in_imagination",
+        explanation="every imagined step draws its action with the same random numbers",
+        provenance="plausible: a random key that is not split",
+        violates=("CON-20", "CON-21"),
+        fix="Use numbers of its own for every step.",
+        edits={"agent.losses": {'np.asarray(noise["action"])[:, t]': 'np.asarray(noise["action"])[:, 0]'}},
+    ),
+    Mutant(
         name="return_range_one_step_late",
         explanation="advantages are scaled by the return range of the step before",
         provenance="plausible",
@@ -173,6 +181,14 @@ MUTANTS = (
         violates=("BEH-14", "AGT-25"),
         fix="Mask with is_last of the step itself.",
         edits={"agent.losses": {'np.asarray(batch["is_last"])[:, :-1]': 'np.asarray(batch["is_last"])[:, 1:]'}},
+    ),
+    Mutant(
+        name="replay_mask_of_another_row",
+        explanation="the ends of episodes are those of another sequence of the batch",
+        provenance="plausible; NM512/dreamerv3-torch cut the batch in place of the time until commit 52782d3 (pull request 6)",
+        violates=("BEH-14", "AGT-25"),
+        fix="The axes are batch and time, in this order.",
+        edits={"agent.losses": {'np.asarray(batch["is_last"])[:, :-1]': 'np.roll(batch["is_last"], 1, axis=0)[:, :-1]'}},
     ),
     Mutant(
         name="replay_critic_does_not_train_the_model",
@@ -227,6 +243,14 @@ MUTANTS = (
         violates=("AGT-26",),
         fix="Weight the dynamics loss with 1 and the representation loss with 0.1.",
         edits={"agent._loss_scale": {"return float(": 'return (0.5 if name == "dynamics" else 1.0) * float('}},
+    ),
+    Mutant(
+        name="no_replay_critic",
+        explanation="the critic learns from imagination alone",
+        provenance="2023 edition, NM512/dreamerv3-torch and sheeprl (D-131)",
+        violates=("AGT-26",),
+        fix="Add the replayed critic loss with the weight 0.3.",
+        edits={"agent._loss_scale": {"return float(": 'return 0.0 if name == "replay_critic" else float('}},
     ),
     Mutant(
         name="representation_loss_weighted_fully",

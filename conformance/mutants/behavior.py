@@ -87,6 +87,21 @@ MUTANTS = (
         edits={"behavior.actor_loss": {"(returns - value) / scale": "returns / scale - value"}},
     ),
     Mutant(
+        name="advantage_standardized",
+        explanation="advantages are divided by their standard deviation, and their mean is subtracted",
+        provenance="plausible: the normalization of PPO",
+        violates=("BEH-9",),
+        fix="Divide the difference of return and value by the return scale.",
+        edits={
+            "behavior.actor_loss": {
+                "advantage = stop_gradient((returns - value) / scale)": (
+                    "difference = returns - value\n"
+                    "    advantage = stop_gradient((difference - difference.mean()) / (difference.std() + 1e-8) + 0.0 * scale)"
+                )
+            }
+        },
+    ),
+    Mutant(
         name="no_baseline",
         explanation="the actor learns from the return in place of the advantage",
         provenance="plausible: the plain Reinforce estimator",

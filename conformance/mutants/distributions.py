@@ -141,6 +141,20 @@ MUTANTS = (
         },
     ),
     Mutant(
+        name="continue_is_nan_at_one_half",
+        explanation="imagined returns use the most likely continue flag, which is NaN where both are as likely",
+        provenance="sheeprl until issue 186: the mode of a Bernoulli distribution of PyTorch",
+        violates=("DIS-18", "RET-3"),
+        fix="Use the sigmoid of the logit.",
+        edits={
+            "distributions.bernoulli_mean": {
+                'return _sigmoid(checked("logit", logit, ...))': (
+                    "logit = np.asarray(logit, dtype=np.float64)\n    return np.where(np.isnan(logit) | (logit == 0), np.nan, logit > 0.0)"
+                )
+            }
+        },
+    ),
+    Mutant(
         name="continue_is_the_logit",
         explanation="the logit of the continue head is used as a probability",
         provenance="naivoder's implementation; TorchRL used logits of reward and value as numbers (issue 4066)",

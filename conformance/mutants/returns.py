@@ -63,6 +63,14 @@ MUTANTS = (
         },
     ),
     Mutant(
+        name="return_of_one_step",
+        explanation="the return is one reward and the value of the next state",
+        provenance="plausible: temporal-difference learning, lambda = 0",
+        violates=("RET-1", "RET-5"),
+        fix="Mix in the later returns with lambda = 0.95.",
+        edits={"returns.lambda_return": {"(1 - lambda_) * value[:, t + 1] + lambda_ * later": "value[:, t + 1]"}},
+    ),
+    Mutant(
         name="return_starts_from_zero",
         explanation="lambda-return ends with 0 in place of the value of the last state",
         provenance="plausible: the return of a finished episode",
@@ -137,6 +145,19 @@ MUTANTS = (
         violates=("RET-14",),
         fix="decay old + (1 - decay) new, with the decay 0.99.",
         edits={"returns.update_return_range": {"decay = config.return_decay": "decay = 1 - config.return_decay"}},
+    ),
+    Mutant(
+        name="return_range_of_extremes",
+        explanation="the return range is that between the smallest and the largest return, so that one outlier shrinks all advantages",
+        provenance="plausible: minimum and maximum in place of percentiles",
+        violates=("RET-14",),
+        fix="Take the 5th and the 95th percentile.",
+        edits={
+            "returns.update_return_range": {
+                "percentile(returns, config.return_percentile_low)": "percentile(returns, 0.0)",
+                "percentile(returns, config.return_percentile_high)": "percentile(returns, 100.0)",
+            }
+        },
     ),
     Mutant(
         name="return_scale_without_limit",

@@ -22,7 +22,7 @@ MUTANTS = (
     Mutant(
         name="bins_evenly_spaced",
         explanation="the bins are the numbers from -20 to 20 themselves, without symexp",
-        provenance="2023 edition, whose bins lie in symlog space",
+        provenance="2023 edition, whose bins lie in symlog space; PPO-v3 encoded raw returns with such bins (issue 4)",
         violates=("TRA-5",),
         fix="Space the bins exponentially: symexp of the numbers from -20 to 20.",
         edits={

@@ -38,6 +38,14 @@ MUTANTS = (
         edits={"world_model.world_model_losses": {'reward_logits, batch["reward"]': 'reward_logits, np.roll(batch["reward"], 1, axis=1)'}},
     ),
     Mutant(
+        name="reward_squashed",
+        explanation="the reward head learns tanh of the reward",
+        provenance="DreamerV2 on Atari (D-71)",
+        violates=("WM-6",),
+        fix="Learn the raw reward: the two-hot loss copes with any scale.",
+        edits={"world_model.world_model_losses": {'reward_logits, batch["reward"]': 'reward_logits, np.tanh(batch["reward"])'}},
+    ),
+    Mutant(
         name="reward_by_squared_error",
         explanation="the reward is learnt by the squared error in symlog space",
         provenance="a sentence of the paper that is left from its first version (D-13)",
