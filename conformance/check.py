@@ -90,15 +90,17 @@ class Run:
     """One check on one adapter.
 
     dtype: precision of the candidate. profile: name of the profile that configurations are drawn from. seed and examples: of the drawn
-    cases. `compared` counts numbers compared, so that a check that compares nothing can be told from one that passes.
+    cases. shrink: whether hypothesis makes a case that deviates smaller, which takes longer. `compared` counts numbers compared, so that
+    a check that compares nothing can be told from one that passes.
     """
 
-    def __init__(self, adapter: object, dtype: str, profile: str, seed: int = 0, examples: int = 25) -> None:
+    def __init__(self, adapter: object, dtype: str, profile: str, seed: int = 0, examples: int = 25, shrink: bool = True) -> None:
         self.adapter = adapter
         self.dtype = dtype
         self.profile = profile
         self.seed = seed
         self.examples = examples
+        self.shrink = shrink
         self.worst = Worst()
         self.compared = 0
         self.last_call: Call | None = None  # of the candidate; after a deviation, that of the smallest case that deviates
@@ -189,6 +191,7 @@ class Run:
                 deadline=None,
                 database=None,
                 suppress_health_check=list(hypothesis.HealthCheck),
+                phases=[phase for phase in hypothesis.Phase if self.shrink or phase is not hypothesis.Phase.shrink],
                 report_multiple_bugs=False,  # several deviations would come as a group, which is no Deviation
             )(wrapped)
             hypothesis.seed(self.seed)(wrapped)()

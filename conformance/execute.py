@@ -64,11 +64,15 @@ def missing(adapter: object, check: Check) -> list[str]:
     return [name for name in check.uses if not callable(getattr(adapter, name, None))]
 
 
-def run_check(check: Check, adapter: object, dtype: str, profile: str, seed: int = 0, examples: int = 25) -> Result:
+def run_check(check: Check, adapter: object, dtype: str, profile: str, seed: int = 0, examples: int = 25, shrink: bool = True) -> Result:
     """Runs one check; what the candidate raises becomes a result."""
     if lacking := missing(adapter, check):
         return Result(check, "not offered", Worst(), 0, f"the adapter does not offer {', '.join(lacking)}")
-    run = Run(adapter, dtype, profile, seed, examples)
+    return finish(check, Run(adapter, dtype, profile, seed, examples, shrink))
+
+
+def finish(check: Check, run: Run) -> Result:
+    """Runs a check to its end or to its first deviation."""
     try:
         check.body(run)
     except Deviation as deviation:

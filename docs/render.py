@@ -19,6 +19,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from conformance.commands.mutants import is_named
 from spec import benchmarks, hyperparameters, profiles, sizes
 from train.report import catalogue
 
@@ -116,14 +117,40 @@ def conformance_chapters() -> str:
     return markdown_table(["requirements", *(f"{backend}, {profile}" for backend, _, profile in runs)], rows)
 
 
-def mutant_table() -> str:
-    """Every planted mistake and what caught it."""
-    mutants = json.loads((RESULTS / "mutants.json").read_text(encoding="utf-8"))["mutants"]
+def mutants() -> dict[str, dict[str, dict[str, Any]]]:
+    """The committed run of `conformance mutants --diagnose --json`: chapter -> mutant -> what it is, what caught it, what it was named."""
+    chapters: dict[str, dict[str, dict[str, Any]]] = {}
+    for name, entry in json.loads((RESULTS / "mutants.json").read_text(encoding="utf-8"))["mutants"].items():
+        chapters.setdefault(entry["chapter"], {})[name] = entry
+    return dict(sorted(chapters.items()))
+
+
+def mutant_summary() -> str:
+    """For each chapter how many mutants there are, how many were caught and how many named."""
     rows = []
-    for name, entry in mutants.items():
-        first = f"`{entry['caught_by'][0]}`" if entry["caught_by"] else "nothing"
-        rows.append([f"`{name}`", entry["mistake"], str(len(entry["caught_by"])), first])
-    return markdown_table(["mutant", "mistake", "checks that catch it", "for example"], rows)
+    for chapter, entries in mutants().items():
+        caught = sum(bool(entry["deviates_in"] + entry["raises_in"]) for entry in entries.values())
+        named = sum(is_named(name, entry["diagnosis"]) for name, entry in entries.items())
+        rows.append([f"[{Path(chapter).stem}](../{chapter})", *map(str, (len(entries), caught, named))])
+    totals = [str(sum(int(row[column]) for row in rows)) for column in (1, 2, 3)]
+    return markdown_table(["chapter", "mutants", "caught", "named"], [*rows, ["all", *totals]])
+
+
+def mutant_tables() -> str:
+    """Every mutant: a table for each chapter."""
+    return "\n".join(f"### [{chapter}](../{chapter})\n\n{_mutants_of(entries)}" for chapter, entries in mutants().items())
+
+
+def _mutants_of(entries: dict[str, dict[str, Any]]) -> str:
+    rows = []
+    for name, entry in entries.items():
+        killers = entry["deviates_in"] + entry["raises_in"]
+        caught = f"{len(killers)}: `{killers[0]}`" if killers else "nothing"
+        first = entry["diagnosis"][0] if entry["diagnosis"] else {"mutant": "nothing", "alternatives": []}
+        named = "itself" if is_named(name, entry["diagnosis"]) else ", ".join(f"`{n}`" for n in (first["mutant"], *first["alternatives"]))
+        texts = [entry[part].replace("|", "\\|") for part in ("explanation", "provenance", "fix")]
+        rows.append([f"`{name}`", *texts[:2], ", ".join(entry["violates"]), texts[2], caught, named])
+    return markdown_table(["mutant", "mistake", "provenance", "violates", "fix", "caught by", "named"], rows)
 
 
 def train_step_table() -> str:
@@ -162,7 +189,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "benchmarks": benchmark_table,
     "conformance_summary": conformance_summary,
     "conformance_chapters": conformance_chapters,
-    "mutants": mutant_table,
+    "mutant_summary": mutant_summary,
+    "mutants": mutant_tables,
     "train_step": train_step_table,
     "learning": learning_table,
     "metrics": catalogue.markdown,

@@ -152,15 +152,11 @@ def transposed_convolution(x: Any, kernel: Any, bias: Any) -> Array:
     """
     x, kernel, bias = _image_kernel_bias(x, kernel, bias)
     height, width = x.shape[-3:-1]
-    y = np.zeros((*x.shape[:-3], 2 * height, 2 * width, len(bias)))
-    for i in range(height):
-        for j in range(width):
-            for row in range(KERNEL):
-                for column in range(KERNEL):
-                    to_row, to_column = 2 * i + row - 1, 2 * j + column - 1
-                    if 0 <= to_row < 2 * height and 0 <= to_column < 2 * width:
-                        y[..., to_row, to_column, :] += x[..., i, j, :] @ kernel[row, column]
-    return y + bias
+    padded = np.zeros((*x.shape[:-3], 2 * height + 3, 2 * width + 3, len(bias)))
+    for row in range(KERNEL):
+        for column in range(KERNEL):
+            padded[..., row : row + 2 * height : 2, column : column + 2 * width : 2, :] += x @ kernel[row, column]
+    return padded[..., 1 : 1 + 2 * height, 1 : 1 + 2 * width, :] + bias
 
 
 def max_pool(x: Any) -> Array:

@@ -9,30 +9,56 @@ from typing import Any
 import numpy as np
 import pytest
 
-from conformance import cli, mutants
+from conformance import cli
 from conformance.adapter import load_adapter
 from conformance.adapters.numpy_adapter import NumpyAdapter
 from conformance.check import Check, Run, round_to
 from conformance.commands import mutants as command
 from conformance.execute import run_check, selected_checks
-from conformance.mutants import MUTANTS, MutantAdapter
+from conformance.mutants import MUTANTS, Mutant, caught_by, relevant, sound, trial
+from conformance.requirements import chapter_of, requirements
+from impl_torch import agent as torch_agent
 from reference_numpy import layers
 
 CHECKS = selected_checks("float64")
 NARROW_CHECKS = {check.name: check for check in selected_checks("bfloat16")}
+ROWS = ("transforms", "distributions", "layers", "rssm", "networks", "world_model", "returns", "behavior", "optimizer", "agent",
+        "replay", "training_loop")  # fmt: skip
 
-
-@functools.cache
-def passes_without_a_mistake(check: Check) -> bool:
-    """A check that fails anyway would catch everything."""
-    return run_check(check, NumpyAdapter(), "float64", "paper", examples=5).status == "pass"
+reach = functools.cache(lambda: sound(CHECKS)[0])
 
 
 @pytest.mark.parametrize("name", MUTANTS)
 def test_the_mistake_is_caught(name: str) -> None:
-    adapter = MutantAdapter(MUTANTS[name])
-    caught = (check for check in CHECKS if run_check(check, adapter, "float64", "paper", examples=5).status in ("fail", "error"))
-    assert any(passes_without_a_mistake(check) for check in caught), f"no check caught: {MUTANTS[name].explanation}"
+    """By a deviation: a mutant that only crashes would say nothing of the numbers that a check compares."""
+    mutant = MUTANTS[name]
+    found = trial(mutant, relevant(mutant, reach()))
+    assert any(result.status == "fail" for result in found), f"no check caught: {mutant.explanation}"
+
+
+def test_the_catalogue_is_complete() -> None:
+    assert len(MUTANTS) >= 70
+    modules = [f"{target.partition('.')[0]}" for mutant in MUTANTS.values() for target in mutant.edits]
+    assert set(modules) == set(ROWS)
+    for mutant in MUTANTS.values():
+        assert mutant.explanation, mutant.name
+        assert mutant.provenance, mutant.name
+        assert mutant.fix.endswith("."), mutant.name
+        assert set(mutant.violates) <= set(requirements()), mutant.name
+
+
+def test_chapters_of_requirements() -> None:
+    assert chapter_of("RET-1") == "spec/07-returns.md"
+    assert MUTANTS["return_bootstraps_from_itself"].chapter == "spec/07-returns.md"
+    with pytest.raises(ValueError, match="RET-999"):
+        chapter_of("RET-999")
+
+
+def test_a_mistake_that_does_not_fit_the_source_is_an_error() -> None:
+    for text, count in (("np.arctan", 0), ("np.", 4)):
+        wrong = Mutant("wrong", "none", "none", ("LAY-5",), "none.", {"layers.silu": {text: "1"}})
+        with pytest.raises(ValueError, match=f"mutant wrong: layers.silu holds {count} times '{text}'"):
+            _ = wrong.replacements
 
 
 @pytest.mark.parametrize("profile", ["paper", "official"])
@@ -40,6 +66,10 @@ def test_the_mistake_is_caught(name: str) -> None:
 def test_the_reference_passes(check, profile: str) -> None:
     result = run_check(check, NumpyAdapter(), "float64", profile)
     assert result.status in ("pass", "not offered"), result.message
+
+
+def silu_mutant(name: str, wrong: str) -> Mutant:
+    return Mutant(name, f"silu is {wrong}", "plausible", ("LAY-5",), "Use silu.", {"layers.silu": {"x / (1.0 + np.exp(-x))": wrong}})
 
 
 def test_broken_checks_catch_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -63,22 +93,38 @@ def test_broken_checks_catch_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     bodies = (deviates, raises, right, literal, index)
     checks = [Check(f"row.{body.__name__}", (), ("silu",), 0, body, ("float64",)) for body in bodies]
     planted = {
-        "harmless": mutants.Mutant("harmless", "none", {"layers.silu": layers.silu}),
-        "scalar": mutants.Mutant("scalar", "silu forgets the axes", {"layers.silu": lambda x: np.float64(0.5)}),
+        "harmless": silu_mutant("harmless", "(x / (1.0 + np.exp(-x)))"),
+        "scalar": silu_mutant("scalar", "np.float64(0.5)"),
     }
     monkeypatch.setattr(command, "selected_checks", lambda dtype: checks)
     monkeypatch.setattr(command, "MUTANTS", planted)
     assert cli.main(["mutants", "--json", str(tmp_path / "mutants.json")]) == 1
-    report = json.loads((tmp_path / "mutants.json").read_text(encoding="utf-8"))
-    assert {name: entry["caught_by"] for name, entry in report["mutants"].items()} == {
-        "harmless": [],
-        "scalar": ["row.literal", "row.index"],
+    report = json.loads((tmp_path / "mutants.json").read_text(encoding="utf-8"))["mutants"]
+    assert {name: (entry["deviates_in"], entry["raises_in"]) for name, entry in report.items()} == {
+        "harmless": ([], []),
+        "scalar": (["row.literal"], ["row.index"]),
     }
-    assert mutants.caught_by(planted["scalar"], checks[2:]) == {"fail": ["row.literal"], "error": ["row.index"]}
+    assert report["scalar"]["chapter"] == "spec/03-layers.md"
+    assert caught_by(planted["scalar"], checks[2:]) == {"fail": ["row.literal"], "error": ["row.index"]}
     out = capsys.readouterr().out
     assert "row.deviates is not counted" in out
     assert "row.raises is not counted" in out
     assert "2 mutants, 1 survived; 3 checks, 2 more" in out
+
+
+def test_the_command_names_what_it_does_not_know(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["mutants", "--only", "nothing_of_this_name"]) == 2
+    assert "no mutant matches --only 'nothing_of_this_name'" in capsys.readouterr().err
+
+
+def test_only_relevant_checks_are_run() -> None:
+    """Those that call what the mutant changes come first; a check that cannot reach it is left out."""
+    names = [check.name for check in relevant(MUTANTS["return_bootstraps_from_itself"], reach())]
+    assert names[0].startswith("returns.lambda_return")
+    assert "agent.losses_match" in names
+    assert "optimizer.laprop_matches" not in names
+    queue = MUTANTS["no_online_queue"]
+    assert {check.name.partition(".")[0] for check in relevant(queue, reach())} == {"replay"}
 
 
 def run_narrow(name: str, adapter: object) -> tuple[str, str]:
@@ -119,3 +165,12 @@ def test_gradients_that_are_rounded_are_seen(name: str) -> None:
     assert run_narrow(check, NarrowGradients(lambda parameter: "conv" in parameter and parameter.endswith("kernel")))[0] == "pass"
     status, message = run_narrow(check, NarrowGradients(lambda parameter: parameter == name))
     assert (status, name in message) == ("fail", True), message
+
+
+def test_swapped_weights_of_the_kl_losses_are_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both losses have the same value, so that the total is right and only its gradient is wrong, which the reference cannot give."""
+    right, swapped = torch_agent.loss_scale, {"dynamics": "representation", "representation": "dynamics"}
+    monkeypatch.setattr(torch_agent, "loss_scale", lambda name, config: right(swapped.get(name, name), config))
+    checks = {check.name: check for check in CHECKS}
+    for name, status in (("agent.losses_match", "pass"), ("agent.total_gradient_is_the_weighted_sum", "fail")):
+        assert run_check(checks[name], load_adapter("torch"), "float64", "paper").status == status

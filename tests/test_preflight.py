@@ -8,7 +8,7 @@ import pytest
 
 from conformance import preflight as module
 from conformance.adapter import load_adapter
-from conformance.mutants import Mutant, MutantAdapter
+from conformance.mutants import PlantedAdapter
 from conformance.preflight import preflight, preflight_adapter
 from conformance.problems import Problem, make_problem, with_sampling_margin
 from reference_numpy import layers
@@ -80,7 +80,7 @@ LINEAR, CONVOLUTION = layers.linear, layers.convolution
     ],
 )
 def test_tf32_is_not_float32(name: str, wrong: Callable[..., Any]) -> None:
-    adapter = MutantAdapter(Mutant("tf32", "operands are rounded to TF32", {f"layers.{name}": wrong}))
+    adapter = PlantedAdapter({f"layers.{name}": wrong})
     report = preflight_adapter(adapter, SPACES, config("float32"))
     assert not report.passed
     assert report.worst > 3 * module.NETWORK_BOUND["float32"]

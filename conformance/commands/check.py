@@ -8,6 +8,7 @@ from rich.console import Console
 
 from conformance.candidate import candidate, remarks
 from conformance.check import DTYPES, Check
+from conformance.diagnosis import diagnose
 from conformance.errors import UserError
 from conformance.execute import Result, Settings, run_check, selected_checks
 from conformance.expected import ExpectedFailures, read_expected
@@ -64,7 +65,9 @@ def main(console: Console, options: argparse.Namespace) -> int:
             console.print(remark, markup=False, highlight=False)
         implementation = identity(adapter, settings)
         results = list(_run_all(console, checks, adapter, settings))
-        data = result_data(settings, implementation, results, expected)
+        with console.status("comparing failures with known mistakes"):
+            diagnoses = diagnose(adapter, results, settings.dtype, settings.profile, settings.seed, settings.examples)
+        data = result_data(settings, implementation, results, expected, [diagnosis.to_json() for diagnosis in diagnoses])
     terminal.show(console, data)
     if options.json:
         write(options.json, data)

@@ -34,6 +34,8 @@ def show(console: Console, data: Data) -> None:
         console.print(f"\n[bold]behaves like {escape(diagnosis['mutant'])}[/]: {escape(diagnosis['explanation'])}", highlight=False)
         console.print(f"  see {diagnosis['chapter']}. {diagnosis['fix']}", markup=False, highlight=False)
         console.print(f"  explains {', '.join(diagnosis['explained'])}", markup=False, highlight=False)
+        if diagnosis["alternatives"]:
+            console.print(f"  cannot be told from {', '.join(diagnosis['alternatives'])}", markup=False, highlight=False)
     failing = [(name, check) for name, check in summary.failures(data) if not summary.is_expected(check)]
     for name, check in failing[:SHOWN]:
         console.print(f"\n[bold red]{name}[/] ({', '.join(check['requirements'])}): {escape(check['summary'])}", highlight=False)

@@ -1,0 +1,27 @@
+"""Mutants: the reference with one realistic mistake each, one module for every row of the grid.
+
+A check that catches no mutant checks nothing, and a candidate that behaves like a mutant probably has its mistake.
+"""
+
+from conformance.mutants import (
+    agent,
+    behavior,
+    distributions,
+    layers,
+    networks,
+    optimizer,
+    replay,
+    returns,
+    rssm,
+    training_loop,
+    transforms,
+    world_model,
+)
+from conformance.mutants.catalogue import Mutant, MutantAdapter, PlantedAdapter, planted
+from conformance.mutants.trial import caught_by, relevant, sound, trial
+
+__all__ = ["MUTANTS", "Mutant", "MutantAdapter", "PlantedAdapter", "caught_by", "planted", "relevant", "sound", "trial"]
+
+_ROWS = (transforms, distributions, layers, rssm, networks, world_model, returns, behavior, optimizer, agent, replay, training_loop)
+
+MUTANTS: dict[str, Mutant] = {mutant.name: mutant for row in _ROWS for mutant in row.MUTANTS}
