@@ -11,6 +11,7 @@ A part stands between a marker line and an end line, and is never edited by hand
 """
 
 import ast
+import functools
 import json
 import math
 import re
@@ -177,6 +178,18 @@ def learning_table() -> str:
     return markdown_table(["curve", "backend", "seed", "steps", "minutes", "return", "random policy", "ratio"], rows)
 
 
+def replay_table(name: str) -> str:
+    """A committed run of `benchmarks.replay`."""
+    rows = []
+    for entry in json.loads((RESULTS / f"replay-{name}.json").read_text(encoding="utf-8"))["results"]:
+        counts = [entry[key] for key in ("records", "inserts_per_s", "batches_per_s")]
+        times = [f"{entry['write_back_ms']:.2g} ms", f"{entry['write_back_after_save_ms']:.2g} ms", f"{entry['save_s']:.2g} s"]
+        memory = [f"{entry[key]:,} MiB" for key in ("data_mib", "memory_limit_mib", "own_mib", "mapped_mib")]
+        rows.append([entry["kind"], *(f"{count:,}" for count in counts), *times, *memory])
+    header = ["record", "stored", "inserts/s", "batches/s", "write-back", "after a save", "save", "data", "limit", "own memory", "mapped"]
+    return markdown_table(header, rows)
+
+
 def _value(value: object) -> str:
     if isinstance(value, bool):
         return str(value).lower()
@@ -193,6 +206,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "mutants": mutant_tables,
     "train_step": train_step_table,
     "learning": learning_table,
+    "replay_image": functools.partial(replay_table, "image"),
+    "replay_small": functools.partial(replay_table, "small"),
     "metrics": catalogue.markdown,
 }
 
