@@ -15,10 +15,11 @@ from impl_jax.transforms import real
 from spec import Config
 
 
-def _trajectories(**arrays: jax.Array) -> None:
-    """Raises ValueError unless all arrays are [N, n] of one shape with n >= 2. [RET-20]"""
+def _trajectories(least: int, **arrays: jax.Array) -> None:
+    """Raises ValueError unless all arrays are [N, n] of one shape with n >= least. [RET-20]"""
     for name, array in arrays.items():
-        require(array.ndim == 2 and array.shape[1] >= 2, name, "shape [rows, time] with at least 2 times", f"shape {list(array.shape)}")
+        expected = f"shape [rows, time] with {least} or more times"
+        require(array.ndim == 2 and array.shape[1] >= least, name, expected, f"shape {list(array.shape)}")
     require_same_shape(**arrays)
 
 
@@ -36,7 +37,7 @@ def lambda_return(reward: jax.Array, continue_: jax.Array, value: jax.Array, dis
     """Imagined returns: three [N, H+1] -> [N, H]; every quantity has the index of arrival. Section "Critic learning". [RET-1], [RET-2]"""
     reward = real(reward)
     continue_, value = (jnp.asarray(x).astype(reward.dtype) for x in (continue_, value))
-    _trajectories(reward=reward, continue_=continue_, value=value)
+    _trajectories(2, reward=reward, continue_=continue_, value=value)
     factor = discount * continue_[:, 1:]
     return _backward(reward[:, 1:] + factor * ((1.0 - lambda_) * value[:, 1:]), factor * lambda_, value[:, -1])
 
@@ -50,7 +51,7 @@ def replay_lambda_return(
     """
     reward = real(reward)
     is_last, is_terminal, annotation = (jnp.asarray(x).astype(reward.dtype) for x in (is_last, is_terminal, annotation))
-    _trajectories(reward=reward, is_last=is_last, is_terminal=is_terminal, annotation=annotation)
+    _trajectories(1, reward=reward, is_last=is_last, is_terminal=is_terminal, annotation=annotation)
     factor = discount * (1.0 - is_terminal[:, 1:])
     mix = lambda_ * (1.0 - is_last[:, 1:])
     return _backward(reward[:, 1:] + factor * ((1.0 - mix) * annotation[:, 1:]), factor * mix, annotation[:, -1])
@@ -64,7 +65,7 @@ def cumulative_weights(continue_: jax.Array, discount: float) -> jax.Array:
     """
     require(0 < discount <= 1, "discount", "above 0 and at most 1", discount)
     continue_ = real(continue_)
-    _trajectories(continue_=continue_)
+    _trajectories(2, continue_=continue_)
     return jnp.cumprod(discount * continue_[:, :-1], axis=1) / discount
 
 

@@ -9,9 +9,9 @@ from impl_torch.shapes import expect, expect_same_shape, widen
 from spec import Config
 
 
-def _check(first: str, **arrays: Tensor) -> None:
+def _check(least: int, first: str, **arrays: Tensor) -> None:
     shape = arrays[first].shape
-    expect(len(shape) == 2 and shape[1] >= 2, first, "two axes, the second of at least 2", list(shape))
+    expect(len(shape) == 2 and shape[1] >= least, first, f"two axes, the second of at least {least}", list(shape))
     expect_same_shape(**arrays)
 
 
@@ -21,13 +21,13 @@ def _backwards(offset: Tensor, slope: Tensor, last: Tensor) -> Tensor:
     for a, b in zip(reversed(offset.unbind(1)), reversed(slope.unbind(1)), strict=True):
         last = torch.addcmul(a, b, last)
         results.append(last)
-    return torch.stack(results[::-1], 1)
+    return torch.stack(results[::-1], 1) if results else offset
 
 
 @torch.no_grad()
 def lambda_return(reward: Tensor, continue_: Tensor, value: Tensor, discount: float, lambda_: float) -> Tensor:
     """Imagined λ-returns, all with arrival indices: [N, H+1] three times -> [N, H]. [RET-1] [RET-2] [RET-17] [RET-19] [RET-20]"""
-    _check("reward", reward=reward, continue_=continue_, value=value)
+    _check(2, "reward", reward=reward, continue_=continue_, value=value)
     reward, continue_, value = (widen(x)[:, 1:] for x in (reward, continue_, value))
     discounts = discount * continue_
     return _backwards(reward + discounts * (1 - lambda_) * value, discounts * lambda_, value[:, -1])
@@ -38,17 +38,17 @@ def replay_lambda_return(
     reward: Tensor, is_last: Tensor, is_terminal: Tensor, annotation: Tensor, discount: float, lambda_: float
 ) -> Tensor:
     """λ-returns of replayed sequences with true flags: [B, T] four times -> [B, T-1]. [RET-9] [RET-10] [RET-17] [RET-19] [RET-20]"""
-    _check("reward", reward=reward, is_last=is_last, is_terminal=is_terminal, annotation=annotation)
-    annotation = widen(annotation)[:, 1:]
+    _check(1, "reward", reward=reward, is_last=is_last, is_terminal=is_terminal, annotation=annotation)
+    annotation = widen(annotation)
     reward, is_last, is_terminal = (x.to(annotation.dtype)[:, 1:] for x in (reward, is_last, is_terminal))
     discounts, lambdas = discount * (1 - is_terminal), lambda_ * (1 - is_last)
-    return _backwards(reward + discounts * (1 - lambdas) * annotation, discounts * lambdas, annotation[:, -1])
+    return _backwards(reward + discounts * (1 - lambdas) * annotation[:, 1:], discounts * lambdas, annotation[:, -1])
 
 
 @torch.no_grad()
 def cumulative_weights(continue_: Tensor, discount: float) -> Tensor:
     """How far each imagined state counts: [N, H+1] -> [N, H]. [RET-7] [RET-8] [RET-17] [RET-20]"""
-    _check("continue_", continue_=continue_)
+    _check(2, "continue_", continue_=continue_)
     expect(0 < discount <= 1, "discount", "above 0 and at most 1", discount)
     return torch.cumprod(discount * widen(continue_)[:, :-1], 1) / discount
 

@@ -90,6 +90,23 @@ def losses_match(run: Run) -> None:
         run.compare(where + "metrics", metrics, aux["metrics"], magnitude=loss_magnitude(aux), bound=bound)
 
 
+@check("AGT-25", "AGT-26", "RET-9", uses=["losses"], level=2, dtypes=WHOLE)
+def losses_of_short_sequences_match(run: Run) -> None:
+    """Two steps have one replayed value to learn; one step has none, and its loss is 0."""
+    for length in (2, 1):
+
+        def draw(attempt: int, length: int = length) -> Problem:
+            return make_problem(1000 * run.seed + attempt, run.profile, "vector", "discrete", run.dtype, batch_length=length)
+
+        problem = with_sampling_margin(draw, SAMPLING_MARGIN)
+        _, aux = reference.losses(*problem.loss_arguments)
+        _, actual = run.call("losses", *problem.loss_arguments)
+        bound = bound_of(run, 1e-9, 2e-4)
+        run.compare(f"{length} steps", actual["losses"], aux["losses"], magnitude=loss_magnitude(aux), bound=bound)
+        if length == 1:
+            run.exact("replayed value of one step", actual["losses"]["replay_critic"], 0.0)
+
+
 def loss_magnitude(aux: dict[str, Any]) -> float:
     """Losses are means of terms of both signs: rounding is relative to the returns and losses that they are made of."""
     return max(1.0, aux["metrics"]["return_scale"], *(abs(value) for value in aux["losses"].values()))

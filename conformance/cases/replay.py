@@ -227,6 +227,7 @@ def the_queue_of_the_paper(run: Run) -> None:
     run.exact("record that was added, start that was served", served, [(65, 1), (130, 66), (195, 131)])
     together = filled(run, 200, capacity=1000, length=64)
     run.exact("starts of one batch", starts(together.sample([0.0] * 5)), [1, 66, 131, 0, 0])
+    run.exact("the oldest item is served, too", starts(filled(run, 6, capacity=3).sample([0.99])), [1])
     run.exact("evicted entries are dropped", starts(filled(run, 9, capacity=2).sample([0.0])), [5])
     run.exact("and the next one serves the row", starts(filled(run, 10, capacity=2).sample([0.0, 0.0])), [7, 6])
 

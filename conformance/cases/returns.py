@@ -95,6 +95,8 @@ def replay_return_literals(run: Run) -> None:
     is_last[1:, 2] = is_terminal[2, 2] = True
     expected = np.array([[3.09375, 4.375, 3.5, 4], [3.25, 5, 3.5, 4], [2.5, 2, 3.5, 4]])
     run.exact("replay_lambda_return", run.call("replay_lambda_return", reward, is_last, is_terminal, annotation, 0.5, 0.5), expected)
+    one = (array[:, :1] for array in (reward, is_last, is_terminal, annotation))
+    run.exact("one step has no return", run.call("replay_lambda_return", *one, 0.5, 0.5), np.zeros((3, 0)))
 
 
 @check("RET-9", uses=["replay_lambda_return"], level=0)

@@ -87,6 +87,14 @@ def bins_refuse_even_counts(run: Run) -> None:
         run.refuses("exponential_bins", count)
 
 
+@check("TRA-6", "TRA-7", "TRA-10", uses=["exponential_bins", "twohot", "ordered_expectation"], level=0)
+def the_fewest_bins(run: Run) -> None:
+    """There are 3 exponential bins at least, a two-hot encoding over 2 bins, and a mean over 3."""
+    run.expect("exponential_bins", (3,), np.array([-485165194.4097903, 0.0, 485165194.4097903]), bound=1e-12)
+    run.exact("twohot", run.call("twohot", np.array([0.0, -5.0]), np.array([-1.0, 3.0])), [[0.75, 0.25], [1, 0]])
+    run.exact("mean", run.call("ordered_expectation", np.array([0.25, 0.25, 0.5]), np.array([-2.0, 0.0, 2.0])), 0.5)
+
+
 @check("TRA-7", "TRA-8", uses=["twohot"], level=0)
 def twohot_literals(run: Run) -> None:
     """Over the bins -3, -1, 0, 1, 3: 2 is [0,0,0,.5,.5], -.25 is [0,.25,.75,0,0], a bin is itself, 7 is the last bin."""

@@ -183,6 +183,14 @@ MUTANTS = (
         edits={"agent.losses": {'np.asarray(batch["is_last"])[:, :-1]': 'np.asarray(batch["is_last"])[:, 1:]'}},
     ),
     Mutant(
+        name="two_steps_teach_no_value",
+        explanation="sequences of two steps have no replayed critic loss",
+        provenance="plausible: off by one",
+        violates=("AGT-25",),
+        fix="T steps teach T - 1 values.",
+        edits={"agent.losses": {"if length > 1:": "if length > 2:"}},
+    ),
+    Mutant(
         name="replay_mask_of_another_row",
         explanation="the ends of episodes are those of another sequence of the batch",
         provenance="plausible; NM512/dreamerv3-torch cut the batch in place of the time until commit 52782d3 (pull request 6)",

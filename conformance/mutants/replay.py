@@ -60,6 +60,14 @@ MUTANTS = (
         edits={"replay.Replay": {"self._queue.popleft()": "self._queue.pop()"}},
     ),
     Mutant(
+        name="oldest_of_the_queue_is_dropped",
+        explanation="a sequence of the queue that is the oldest of all is taken for evicted",
+        provenance="plausible: > in place of >=",
+        violates=("REP-9",),
+        fix="Drop an entry only if its item is gone.",
+        edits={"replay.Replay": {"start >= self._streams[number].first": "start > self._streams[number].first"}},
+    ),
+    Mutant(
         name="evaluation_empties_the_queue",
         explanation="draws that are not for training take sequences from the queue",
         provenance="plausible",
