@@ -1,5 +1,6 @@
-"""A lockstep as a picture: deviation over steps, a line for each group."""
+"""A lockstep as a picture: deviation over steps, a line for each group, with gaps where it is 0."""
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ STYLES = {
 }
 BOUNDS = {"encoder": "world model", "critic": "critic", "actor": "actor"}
 TITLES = {"free": "running free", "one step": "one step from a common state"}
-SMALLEST, LARGEST = 1e-17, 1e6  # of the axis; 0 and infinity are drawn at its ends
+LARGEST = 1e6  # of the axis, for what has no size
 
 
 def figure_class() -> Any:
@@ -62,7 +63,7 @@ def draw(path: Path, found: dict[str, Any], title: str, bounded: bool) -> None:
 
 def _draw_curves(axes: Any, steps: list[int], curves: dict[str, list[float | None]]) -> None:
     for group, (color, style) in STYLES.items():
-        values = [min(max(LARGEST if value is None else value, SMALLEST), LARGEST) for value in curves[group]]
+        values = [LARGEST if value is None else min(value, LARGEST) or math.nan for value in curves[group]]
         axes.plot(steps[: len(values)], values, style, color=color, linewidth=1.4, marker="." if len(values) < 3 else "", label=group)
 
 
