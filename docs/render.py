@@ -196,6 +196,25 @@ def _value(value: object) -> str:
     return f"{value:,}" if isinstance(value, int) else str(value)
 
 
+def lockstep_table(mode: str, dtypes: tuple[str, ...]) -> str:
+    """The worst deviation of each group in the first 100 steps, and after them."""
+    columns: dict[str, dict[str, list[str]]] = {}
+    for dtype in dtypes:
+        for problem, found in json.loads((RESULTS / f"lockstep-{dtype}.json").read_text(encoding="utf-8"))["problems"].items():
+            early = sum(step <= 100 for step in found["steps"])
+            for name, modes in found["comparisons"].items():
+                curves = modes[mode]["curves"].items()
+                columns[f"{name}, {dtype}, {problem}"] = {group: [_worst(curve[:early]), _worst(curve[early:])] for group, curve in curves}
+    groups = next(iter(columns.values()))
+    return markdown_table(["group", *columns], [[group, *(" / ".join(cells[group]) for cells in columns.values())] for group in groups])
+
+
+def _worst(curve: list[float | None]) -> str:
+    if not curve:
+        return "parted"
+    return "∞" if None in curve else f"{max(value for value in curve if value is not None):.0e}".replace("0e+00", "0")
+
+
 TABLES: dict[str, Callable[[], str]] = {
     "hyperparameters": hyperparameter_table,
     "sizes": size_table,
@@ -209,6 +228,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "replay_image": functools.partial(replay_table, "image"),
     "replay_small": functools.partial(replay_table, "small"),
     "metrics": catalogue.markdown,
+    "lockstep_free": lambda: lockstep_table("free", ("float64",)),
+    "lockstep_one_step": lambda: lockstep_table("one step", ("float64", "float32", "bfloat16")),
 }
 
 

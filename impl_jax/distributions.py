@@ -101,10 +101,12 @@ def symexp_twohot_loss(logits: ArrayLike, target: ArrayLike, bins: ArrayLike) ->
 
 
 def symexp_twohot_mean(logits: ArrayLike, bins: ArrayLike) -> jax.Array:
-    """The mean of the softmax over the bins: [..., K] -> [...], in units of the bins, exactly 0 for equal logits. [DIS-15]"""
+    """The mean of the softmax over the bins: [..., K] -> [...], in units of the bins, exactly 0 for mirror-symmetric logits. [DIS-15]"""
     logits = real(logits)
     weights = jnp.exp(logits - stop_gradient(jnp.max(logits, axis=-1, keepdims=True)))
-    return ordered_expectation(weights / jnp.sum(weights, axis=-1, keepdims=True), bins)
+    # The division comes last: on the CPU, XLA divides some elements of a row by another route than their mirror images, and the last bit of
+    # a weight times the outermost bin is as large as a reward.
+    return ordered_expectation(weights, bins) / jnp.sum(weights, axis=-1)
 
 
 @jax.custom_jvp
