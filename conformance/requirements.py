@@ -22,3 +22,16 @@ def requirements() -> dict[str, str]:
                 raise ValueError(f"{chapter}: the requirement id {identifier} is used twice")
             found[identifier] = line
     return found
+
+
+@functools.cache
+def chapter_of(requirement: str) -> str:
+    """The chapter's path, such as spec/07-returns.md.
+
+    Raises:
+      ValueError: no chapter has such a requirement.
+    """
+    for path in sorted(resources.files("spec").iterdir(), key=lambda path: path.name):
+        if re.match(r"\d\d-.*\.md$", path.name) and f"- **[{requirement}]** " in path.read_text(encoding="utf-8"):
+            return f"spec/{path.name}"
+    raise ValueError(f"no chapter has the requirement {requirement}")

@@ -3,4 +3,4 @@
 A module has a docstring, whose first line is its help, `add_arguments(parser)` and `main(console, options) -> exit code`.
 """
 
-COMMANDS = ("check", "coverage", "mutants", "new_adapter")
+COMMANDS = ("check", "coverage", "mutants", "new_adapter", "vectors")
