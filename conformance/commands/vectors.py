@@ -23,5 +23,5 @@ def main(console: Console, options: argparse.Namespace) -> int:
     cases = sum(len(entry.get("cases", ())) for entry in index["files"].values())
     size = sum(entry["bytes"] for entry in index["files"].values())
     console.print(f"{cases} cases, {size / 1e6:.2f} MB in {options.out}; the format: docs/vectors.md", markup=False, highlight=False)
-    console.print(f"{len(index['left_out'])} checks give no vector; index.json says in words what they ask")
+    console.print(f"{len(index['left_out'])} checks give no vector; index.json says in words what they ask, and why")
     return 0

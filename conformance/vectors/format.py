@@ -54,8 +54,8 @@ class Table:
         return self.array(np.asarray(value))
 
     def array(self, array: np.ndarray) -> dict[str, Any]:
-        """The reference to an array. Real numbers are stored as float32 where that loses nothing."""
-        array = _shortest(array)
+        """The reference to an array."""
+        array = shortest(array)
         if array.dtype.name not in DTYPES:
             raise TypeError(f"expected one of the dtypes {', '.join(DTYPES)}, got {array.dtype}")
         key = f"{array.dtype}{array.shape}".encode() + array.tobytes()
@@ -84,7 +84,8 @@ class Table:
         return array.astype(np.float64) if array.dtype.kind == "f" else array
 
 
-def _shortest(array: np.ndarray) -> np.ndarray:
+def shortest(array: np.ndarray) -> np.ndarray:
+    """The array, real numbers as float32 where that loses nothing."""
     array = np.ascontiguousarray(array).reshape(array.shape)  # the former gives a single number an axis
     if array.dtype.kind != "f":
         return array

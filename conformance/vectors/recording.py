@@ -213,6 +213,15 @@ def _record(check: Check, inputs: str, profile: str, seed: int, examples: int) -
     return vectors
 
 
+def along_one_direction(vector: Vector) -> Vector:
+    """A vector of `loss_derivatives` with the first of its directions alone, rounded to numbers that take little room."""
+    *others, directions = vector.arguments
+    direction = {name: round_to(value, "bfloat16") for name, value in directions[0].items()}
+    derivatives = NumpyAdapter().loss_derivatives(*snapshot(tuple(others)), [direction])
+    outputs = tuple(dataclasses.replace(output, expected=derivatives[output.path[0]]) for output in vector.outputs)
+    return dataclasses.replace(vector, arguments=(*others, (direction,)), outputs=outputs)
+
+
 class _Reading(dict[str, Any]):
     """A mapping that notes which keys are read: all of them where it is walked."""
 

@@ -4,6 +4,7 @@ import dataclasses
 import hashlib
 import importlib.metadata
 import tomllib
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -16,11 +17,11 @@ from conformance.check import DTYPES, EPSILON, SMALLEST_NORMAL, Check
 from conformance.errors import UserError
 from conformance.execute import selected_checks
 from conformance.requirements import chapter_of
-from conformance.vectors.format import FORMAT, Table, to_json, to_npz
+from conformance.vectors.format import FORMAT, Table, shortest, to_json, to_npz
 from conformance.vectors.gradients import gradients
 from conformance.vectors.killing import kills
 from conformance.vectors.reading import Case
-from conformance.vectors.recording import Output, Vector, record
+from conformance.vectors.recording import Output, Vector, along_one_direction, record
 
 FLOOR = {dtype: SMALLEST_NORMAL[wide] / EPSILON[wide] for dtype in DTYPES for wide in ["float64" if dtype == "float64" else "float32"]}
 """The smallest scale of a tolerance: transforms, returns and losses are computed in float32 or better."""
@@ -30,8 +31,8 @@ FLOOR = {dtype: SMALLEST_NORMAL[wide] / EPSILON[wide] for dtype in DTYPES for wi
 class Size:
     """How much of what the checks do a set holds.
 
-    examples: drawn for each property. results, refused: the most cases of each kind for one check. large, bytes: beyond `large` bytes of
-    arrays a check gives at most one case, with a result, and none beyond `bytes`.
+    examples: drawn for each property. results, refused: the most cases of each kind for one function of a check. large, bytes: of cases
+    with more than `large` bytes of arrays there is one at most, with a result, and none with more than `bytes`, or `whole` for WHOLE.
     """
 
     examples: int
@@ -39,9 +40,15 @@ class Size:
     refused: int
     large: int
     bytes: int
+    whole: int
 
 
-SETS = {"minimal": Size(2, 3, 2, 8_000, 64_000), "full": Size(25, 10_000, 10_000, 2**40, 2**40)}
+SETS = {"minimal": Size(2, 2, 1, 1_000, 14_000, 45_000), "full": Size(25, 10_000, 10_000, 2**40, 2**40, 2**40)}
+WHOLE = (
+    *("agent.losses_match", "agent.loss_derivatives_match", "agent.policy_step_matches", "given.losses_given_match"),
+    *("networks.decoder_matches", "world_model.open_loop_matches", "given.observe_given_matches"),
+)
+"""Checks of so much at once that their smallest case is large."""
 
 
 def write_vectors(
@@ -63,10 +70,12 @@ def write_vectors(
         table, cases = Table(), []
         for check in (check for check in checks if _row(check) == row):
             progress(check.name)
-            vectors = list(selected(record(check, profile, seed, SETS[size].examples), SETS[size]))
+            recorded = record(check, profile, seed, SETS[size].examples)
+            vectors = list(selected(recorded, SETS[size]))
             cases += [entry for vector in vectors if (entry := describe_case(vector, table)) is not None]
             if not vectors:
-                left_out.append({"check": check.name, "requirements": list(check.requirements), "what": check.summary})
+                why = "large: in the full set" if recorded else "no golden value"
+                left_out.append({"check": check.name, "requirements": list(check.requirements), "what": check.summary, "why": why})
         if cases:
             files[f"{row}.json"], files[f"{row}.npz"] = to_json({"objects": table.objects, "cases": cases}), to_npz(table.arrays)
             names[f"{row}.json"] = [case["name"] for case in cases]
@@ -96,13 +105,18 @@ def checks_to_record(only: str = "") -> list[Check]:
 
 def selected(vectors: Iterable[Vector], size: Size) -> Iterator[Vector]:
     """The vectors of one check that a set of this size holds."""
-    left = {True: size.refused, False: size.results}
-    large = 1
+    taken: Counter[tuple[str, bool]] = Counter()
+    large: set[str] = set()
     for vector in vectors:
-        kind, weight = vector.refused is not None, _weight((vector.arguments, [output.expected for output in vector.outputs]))
-        if left[kind] and weight <= (size.large if kind or not large else size.bytes):
-            left[kind] -= 1
-            large -= weight > size.large
+        most = size.whole if vector.check.name in WHOLE else size.bytes
+        if vector.function == "loss_derivatives" and weight(vector) > most:
+            vector = along_one_direction(vector)
+        refused, bytes_ = vector.refused is not None, weight(vector)
+        allowed = size.large if refused or vector.function in large else most
+        if taken[vector.function, refused] < (size.refused if refused else size.results) and bytes_ <= allowed:
+            taken[vector.function, refused] += 1
+            if bytes_ > size.large:
+                large.add(vector.function)
             yield vector
 
 
@@ -177,11 +191,15 @@ def _row(check: Check) -> str:
     return check.name.partition(".")[0]
 
 
-def _weight(value: Any) -> int:
-    """Bytes of all arrays in a nested value."""
+def weight(vector: Vector) -> int:
+    """Bytes of the arrays of a vector, as they are stored but for compression."""
+    return _bytes((vector.arguments, tuple(output.expected for output in vector.outputs)))
+
+
+def _bytes(value: Any) -> int:
     if isinstance(value, dict):
-        return sum(map(_weight, value.values()))
-    return sum(map(_weight, value)) if isinstance(value, tuple | list) else np.asarray(value).nbytes if isinstance(value, np.ndarray) else 0
+        return sum(map(_bytes, value.values()))
+    return sum(map(_bytes, value)) if isinstance(value, tuple) else shortest(value).nbytes if isinstance(value, np.ndarray) else 0
 
 
 def package_version() -> str:
