@@ -74,7 +74,7 @@ def test_the_document_is_enough_to_read_the_set() -> None:
 @pytest.mark.parametrize(
     ("right", "mistake", "row"),
     [
-        ("np.log1p(np.abs(x))", "np.log(1 + np.abs(x))", "transforms"),
+        ("np.log1p(np.abs(x))", "np.log1p(np.abs(np.float32(x)))", "transforms"),
         ("value[:, t] + lambda_", "value[:, t - 1] + lambda_", "returns"),
         ("np.searchsorted(bins, x)", "np.searchsorted(bins, x) - 1", "transforms"),
     ],
