@@ -43,7 +43,7 @@ class Size:
     whole: int
 
 
-SETS = {"minimal": Size(2, 2, 1, 600, 9_500, 45_000), "full": Size(25, 10_000, 10_000, 2**40, 2**40, 2**40)}
+SETS = {"minimal": Size(2, 2, 1, 600, 8_000, 45_000), "full": Size(25, 10_000, 10_000, 2**40, 2**40, 2**40)}
 WHOLE = (
     *("agent.losses_match", "agent.loss_derivatives_match", "agent.policy_step_matches", "given.losses_given_match"),
     *("networks.decoder_matches", "world_model.open_loop_matches", "given.observe_given_matches", "rssm.observe_matches"),
