@@ -12,7 +12,7 @@ from conformance.errors import UserError
 from conformance.lockstep.bounds import bound
 from conformance.lockstep.drift import GROUPS, Nested, Tensor, deviations
 from conformance.lockstep.stream import Arrays, Stream, lockstep_config
-from conformance.mutants import Mutant, planted
+from conformance.mutants import planted
 from conformance.problems import spaces
 from reference_numpy import agent, distributions
 from spec import parameter_table
@@ -155,7 +155,7 @@ class Lockstep:
             samples.append(right(log_probs, uniform))
             return samples[-1]
 
-        with planted(Mutant("recorded", "no mistake: samples are looked at", {"distributions.categorical_sample": record})):
+        with planted({"distributions.categorical_sample": record}):
             agent.losses(*self._loss_arguments(state, batch, noise))
         return samples, min(margins)
 
