@@ -4,8 +4,8 @@ import math
 
 from conformance.lockstep.drift import Tensor
 
-# Share of the way that one update may be off, by the part that a tensor belongs to; about a hundred times what was measured.
-WORLD_MODEL = 1e-9  # rounding of stored numbers, relative to an update that is the learning rate times smaller
+# Share of the way that one update may be off, by the part that a tensor belongs to; at least ten times the worst that was measured.
+WORLD_MODEL = 1e-8  # rounding of stored numbers, relative to an update of the learning rate's size; and what follows from the next line
 VALUES = 1e-6  # the mean over bins up to e^20 has an absolute error of 1e-9 while the outer bins are still likely
 ACTOR = 1e-5  # the same absolute error in advantages that are themselves small while the critic leaves zero
 SHARE = {"critic": VALUES, "replay_critic": VALUES, "actor": ACTOR}
