@@ -15,7 +15,7 @@ from conformance.adapters.numpy_adapter import NumpyAdapter
 from conformance.check import Check, Run, round_to
 from conformance.commands import mutants as command
 from conformance.execute import run_check, selected_checks
-from conformance.mutants import MUTANTS, Mutant, caught_by, relevant, sound, trial
+from conformance.mutants import MUTANTS, Mutant, relevant, sound, trial
 from conformance.requirements import chapter_of, requirements
 from impl_torch import agent as torch_agent
 from reference_numpy import layers
@@ -105,7 +105,6 @@ def test_broken_checks_catch_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: 
         "scalar": (["row.literal"], ["row.index"]),
     }
     assert report["scalar"]["chapter"] == "spec/03-layers.md"
-    assert caught_by(planted["scalar"], checks[2:]) == {"fail": ["row.literal"], "error": ["row.index"]}
     out = capsys.readouterr().out
     assert "row.deviates is not counted" in out
     assert "row.raises is not counted" in out

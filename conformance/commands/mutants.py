@@ -77,7 +77,7 @@ def diagnosis_report(diagnosis: Diagnosis) -> dict[str, Any]:
     return {
         "mutant": diagnosis.mutant.name,
         "alternatives": [mutant.name for mutant in diagnosis.alternatives],
-        "explained": list(diagnosis.explained),
+        "explained": len(diagnosis.explained),
         "unexplained": list(diagnosis.unexplained),
     }
 

@@ -18,9 +18,9 @@ from conformance.mutants import (
     world_model,
 )
 from conformance.mutants.catalogue import Mutant, MutantAdapter, PlantedAdapter, planted
-from conformance.mutants.trial import caught_by, relevant, sound, trial
+from conformance.mutants.trial import relevant, sound, trial
 
-__all__ = ["MUTANTS", "Mutant", "MutantAdapter", "PlantedAdapter", "caught_by", "planted", "relevant", "sound", "trial"]
+__all__ = ["MUTANTS", "Mutant", "MutantAdapter", "PlantedAdapter", "planted", "relevant", "sound", "trial"]
 
 _ROWS = (transforms, distributions, layers, rssm, networks, world_model, returns, behavior, optimizer, agent, replay, training_loop)
 

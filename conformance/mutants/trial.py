@@ -86,12 +86,3 @@ def trial(mutant: Mutant, checks: Iterable[Check], examples: int = 5) -> Iterato
     """What the checks find when the mutant is the candidate, one after the other."""
     for check in checks:
         yield on_the_mutant(mutant, check, "float64", "paper", 0, examples)
-
-
-def caught_by(mutant: Mutant, checks: Iterable[Check], examples: int = 5) -> dict[str, list[str]]:
-    """The names of the checks that find a deviation ("fail") and of those in which the mutant raises ("error")."""
-    found: dict[str, list[str]] = {"fail": [], "error": []}
-    for result in trial(mutant, checks, examples):
-        if result.status in found:
-            found[result.status].append(result.check.name)
-    return found
