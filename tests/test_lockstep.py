@@ -25,7 +25,6 @@ from conformance.mutants import MUTANTS, Mutant, MutantAdapter
 from conformance.problems import spaces
 from impl_jax import distributions as jax_distributions
 from impl_torch import distributions as torch_distributions
-from reference_numpy.behavior import update_slow_critic
 from reference_numpy.transforms import exponential_bins
 
 pytestmark = pytest.mark.xdist_group("lockstep")
@@ -126,11 +125,11 @@ def test_mirrored_logits_have_mean_zero(backend: str, rows: int) -> None:
 # Mistakes
 
 
-def _slow_critic_a_little_off(slow: Any, critic: Any, decay: float) -> Any:
-    return update_slow_critic(slow, critic, decay + 1e-4)
-
-
-SLIGHT = Mutant("slight", "the slow critic's decay is off by 1e-4", {"behavior.update_slow_critic": _slow_critic_a_little_off})
+SLIGHT = dataclasses.replace(
+    MUTANTS["slow_critic_decay_swapped"],
+    name="slight",
+    edits={"behavior.update_slow_critic": {"decay * old + (1 - decay) * new": "(decay + 1e-4) * old + (1 - decay - 1e-4) * new"}},
+)
 
 
 @pytest.mark.parametrize(
