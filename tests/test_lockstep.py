@@ -136,11 +136,11 @@ SLIGHT = dataclasses.replace(
     ("mutant", "profile", "step", "tensor"),
     [
         (SLIGHT, "paper", 1, "slow_critic/critic/out/kernel"),
-        (MUTANTS["no_bias_correction"], "paper", 1, "optimizer/momentum/"),
-        (MUTANTS["optimizer_returns_old_critic"], "paper", 1, "params/critic/out/"),
+        (MUTANTS["no_correction_of_the_second_moment"], "paper", 1, "optimizer/momentum/"),
+        (MUTANTS["slow_critic_updated_before_the_step"], "paper", 1, "slow_critic/"),
         (MUTANTS["warmup_starts_at_one"], "official", 1, "params/"),
-        (MUTANTS["return_range_without_average"], "paper", 2, "return_range"),
-        (MUTANTS["free_nats_per_latent"], "paper", 1, "loss dynamics"),
+        (MUTANTS["return_range_not_smoothed"], "paper", 2, "return_range"),
+        (MUTANTS["free_nats_for_each_latent"], "paper", 1, "loss dynamics"),
     ],
     ids=lambda value: getattr(value, "name", None),
 )
