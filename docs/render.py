@@ -190,6 +190,32 @@ def replay_table(name: str) -> str:
     return markdown_table(header, rows)
 
 
+def loop_shares() -> str:
+    """The shares of a committed run of `benchmarks.loop`."""
+    rows = []
+    for entry in _loop()["shares"]:
+        numbers = [f"{entry['speed/steps']:.0f}", f"{entry['speed/train_steps']:.1f}", f"{entry['speed/learner_share']:.1%}"]
+        parts = [f"{entry[f'time/{part}']:.1%}" for part in ("policy", "environments", "replay", "train", "other")]
+        environment = {"Vectors": "no time", "SlowVectors": "20 ms a step"}[entry["environment"]]
+        rows.append([entry["backend"], environment, *numbers, *parts])
+    header = ["backend", "environment", "steps/s", "train steps/s", "learner's share", "policy", "environments", "replay", "train", "other"]
+    return markdown_table(header, rows)
+
+
+def loop_memory() -> str:
+    """The memory of a committed run of `benchmarks.loop`."""
+    rows = [
+        [entry["backend"], f"{step:,}", f"{size:.2f} GiB"]
+        for entry in _loop()["memory"]
+        for step, size in entry["points"][:: len(entry["points"]) // 5]
+    ]
+    return markdown_table(["backend", "environment steps", "memory of the process"], rows)
+
+
+def _loop() -> dict[str, Any]:
+    return json.loads((RESULTS / "loop.json").read_text(encoding="utf-8"))
+
+
 def _value(value: object) -> str:
     if isinstance(value, bool):
         return str(value).lower()
@@ -228,6 +254,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "replay_image": functools.partial(replay_table, "image"),
     "replay_small": functools.partial(replay_table, "small"),
     "metrics": catalogue.markdown,
+    "loop_shares": loop_shares,
+    "loop_memory": loop_memory,
     "lockstep_free": lambda: lockstep_table("free", ("float64",)),
     "lockstep_one_step": lambda: lockstep_table("one step", ("float64", "float32", "bfloat16")),
 }

@@ -73,6 +73,7 @@ def assert_same_run(logdir: Path, other: Path) -> None:
 
 def kill_and_resume(backend: str, kills: int, folder: Path, seed: int) -> int:
     """Kills a run that often, lets it end, and compares. Returns how often it went on from a checkpoint."""
+    folder.mkdir(exist_ok=True)
     whole, broken = folder / "whole", folder / "broken"
     began = time.monotonic()
     finish(command(backend, whole, "--checkpoint-every", "1e9"), folder / "whole.txt")
@@ -104,8 +105,11 @@ def test_many_killed_runs_continue_bit_by_bit(backend: str, tmp_path: Path) -> N
     for run in range(10):
         resumed += kill_and_resume(backend, 10, tmp_path / str(run), seed=run + 1)
         shutil.rmtree(tmp_path / str(run))
+        print(
+            f"{backend}: {run + 1} runs, {10 * (run + 1)} kills, {resumed} times continued from a checkpoint, all equal bit by bit",
+            flush=True,
+        )
     assert resumed > 50
-    print(f"{backend}: 10 runs, 100 kills, {resumed} times continued from a checkpoint, all equal bit by bit")
 
 
 def test_a_signal_saves_and_leaves(tmp_path: Path) -> None:
