@@ -204,11 +204,7 @@ def loop_shares() -> str:
 
 def loop_memory() -> str:
     """The memory of a committed run of `benchmarks.loop`."""
-    rows = [
-        [entry["backend"], f"{step:,}", f"{size:.2f} GiB"]
-        for entry in _loop()["memory"]
-        for step, size in entry["points"][:: len(entry["points"]) // 5]
-    ]
+    rows = [[entry["backend"], f"{step:,}", f"{size:.2f} GiB"] for entry in _loop()["memory"] for step, size in entry["points"]]
     return markdown_table(["backend", "environment steps", "memory of the process"], rows)
 
 
