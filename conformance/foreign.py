@@ -1,5 +1,6 @@
 """What strangers' functions return, brought into the form that the checks compare: only where it can mean one thing."""
 
+import abc
 import inspect
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -22,18 +23,20 @@ HOLD_LATENTS = (
 )
 
 
-class ForeignAdapter:
+class ForeignAdapter(abc.ABC):
     """An adapter that somebody else wrote. Subclasses say what is offered and how it is called, and give results of `to_numpy`."""
 
+    @abc.abstractmethod
     def offers(self, name: str) -> bool:
-        raise NotImplementedError
+        """Whether the implementation has a function of this name."""
 
+    @abc.abstractmethod
     def call(self, name: str, arguments: tuple[Any, ...]) -> Any:
-        raise NotImplementedError
+        """The result of one of its functions."""
 
+    @abc.abstractmethod
     def edition(self) -> str | None:
         """The edition that the implementation claims."""
-        raise NotImplementedError
 
     def __getattr__(self, name: str) -> Any:
         if name not in INTERFACE or not self.offers(name):
