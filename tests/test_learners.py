@@ -1,12 +1,10 @@
 """Both learners as training uses them: their state, their random numbers, and what one may take over from the other."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
-import jax
 import numpy as np
 import pytest
-from jax.experimental.compilation_cache import compilation_cache
 from safetensors.numpy import load, load_file, save
 
 from conformance.problems import random_batch, random_observations, random_state, small_config, spaces
@@ -14,6 +12,8 @@ from reference_numpy import agent as reference
 from spec import Config, Discrete, Spaces, parameter_table
 from train import checkpoint
 from train.backend import Learner, learner_class
+
+pytestmark = pytest.mark.usefixtures("compile_once")
 
 BACKENDS = ("jax", "torch")
 ENVS = 6
@@ -31,19 +31,6 @@ def make(backend: str, seed: int = 0, task: Spaces = TASK, config: Config = CONF
 @pytest.fixture(scope="module", params=BACKENDS)
 def backend(request: pytest.FixtureRequest) -> str:
     return request.param
-
-
-@pytest.fixture(scope="module", autouse=True)
-def compile_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """JAX learners with the same configuration compile the same programs, whatever their seed."""
-    settings = {"jax_compilation_cache_dir": str(tmp_path_factory.mktemp("compiled")), "jax_persistent_cache_min_compile_time_secs": 0.0}
-    before = {name: getattr(jax.config, name) for name in settings}
-    for values in (settings, before):
-        for name, value in values.items():
-            jax.config.update(name, value)
-        compilation_cache.reset_cache()
-        if values is settings:
-            yield
 
 
 @pytest.fixture(scope="module")

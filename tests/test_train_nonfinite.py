@@ -3,14 +3,12 @@
 import dataclasses
 import json
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 import pytest
-from jax.experimental.compilation_cache import compilation_cache
 
 from conformance.problems import random_batch, random_state, small_config, spaces
 from reference_numpy import agent, optimizer
@@ -20,24 +18,13 @@ from train.commands import inspect
 from train.errors import UserError
 from train.nonfinite import Tally, load_incident, newest_incident, offending, save_incident, stop_error, tally
 
+pytestmark = pytest.mark.usefixtures("compile_once")
+
 TASK = spaces("vector", "discrete")
 LAYERS = {f"{part}_layers": 1 for part in ("encoder", "decoder", "posterior", "prior", "reward", "continue", "actor", "critic")}
 CONFIG = small_config("paper", "float32", **LAYERS)
 
 Arrays = dict[str, np.ndarray]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def compile_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """A second learner of one kind compiles nothing."""
-    settings = {"jax_compilation_cache_dir": str(tmp_path_factory.mktemp("compiled")), "jax_persistent_cache_min_compile_time_secs": 0.0}
-    before = {name: getattr(jax.config, name) for name in settings}
-    for values in (settings, before):
-        for name, value in values.items():
-            jax.config.update(name, value)
-        compilation_cache.reset_cache()
-        if values is settings:
-            yield
 
 
 @pytest.fixture(scope="module", params=["jax", "torch"])

@@ -2,14 +2,11 @@
 
 import json
 import math
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 import pytest
-from jax.experimental.compilation_cache import compilation_cache
 from train_agents import random_learner_state, save_checkpoint
 
 import train.commands.eval
@@ -28,24 +25,13 @@ from train.evaluation import Episode
 from train.logger import read_metrics
 from train.replay import Replay
 
+pytestmark = pytest.mark.usefixtures("compile_once")
+
 CONFIG = small_config("paper", "float32", envs=2)
 COUNTING = Spaces({"observation": Vector(2)}, {"action": Vector(2)})
 CARTPOLE = Spaces({"observation": Vector(4)}, {"action": Discrete((2,))})
 ARM = Spaces({"position": Vector(3), "mode": Discrete((3, 2))}, {"arm": Vector(2), "buttons": Discrete((2, 3))})
 ROBOT = Spaces({"position": Vector(3), "image": Image(16, 16, 3)}, {"arm": Vector(2), "buttons": Discrete((2, 3))})
-
-
-@pytest.fixture(scope="module", autouse=True)
-def compile_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """A run that goes back to JAX compiles the programs of the run that began it."""
-    settings = {"jax_compilation_cache_dir": str(tmp_path_factory.mktemp("compiled")), "jax_persistent_cache_min_compile_time_secs": 0.0}
-    before = {name: getattr(jax.config, name) for name in settings}
-    for values in (settings, before):
-        for name, value in values.items():
-            jax.config.update(name, value)
-        compilation_cache.reset_cache()
-        if values is settings:
-            yield
 
 
 # train eval
