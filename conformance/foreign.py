@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from conformance.adapter import INTERFACE, OBJECTS, RESULTS, Adapter
+from conformance.errors import UserError
 from spec import Config
 
 MAPPINGS = frozenset(
@@ -36,7 +37,11 @@ class ForeignAdapter(abc.ABC):
 
     @abc.abstractmethod
     def edition(self) -> str | None:
-        """The edition that the implementation claims."""
+        """The edition that the implementation claims.
+
+        Raises:
+          UserError: it claims something that is no name.
+        """
 
     def __getattr__(self, name: str) -> Any:
         if name not in INTERFACE or not self.offers(name):
@@ -47,6 +52,17 @@ class ForeignAdapter(abc.ABC):
             return result if name in OBJECTS else arranged(name, arguments, result)
 
         return function
+
+
+def as_edition(claim: Any) -> str | None:
+    """What an implementation returned as its edition.
+
+    Raises:
+      UserError: it is neither a name nor None.
+    """
+    if claim is not None and not isinstance(claim, str):
+        raise UserError(f"edition: expected a name or nothing, got {claim!r:.80}")
+    return claim
 
 
 def arranged(name: str, arguments: Sequence[Any], result: Any) -> Any:
