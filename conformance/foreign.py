@@ -81,7 +81,10 @@ def arranged(name: str, arguments: Sequence[Any], result: Any) -> Any:
     elif isinstance(result, Mapping):
         raise TypeError(f"{name}: expected one array, got {_kind(result)}: return the entry that is meant")
     elif isinstance(result, tuple):
-        result = np.asarray(result)
+        try:
+            result = np.asarray(result)
+        except ValueError as error:  # not one of ours: a ValueError says that an argument is refused
+            raise TypeError(f"{name}: expected one array, got a tuple of parts that do not stack") from error
 
     config = next((argument for argument in arguments if isinstance(argument, Config)), None)
     if name == "categorical_sample":

@@ -97,6 +97,8 @@ def test_several_results_come_in_any_dress() -> None:
             arranged("kl_losses", losses, to_numpy(result))
     with pytest.raises(TypeError, match="symlog: expected one array, got a dict with the keys 'x'"):
         arranged("symlog", (np.ones(2),), {"x": np.ones(2)})
+    with pytest.raises(TypeError, match="symlog: expected one array, got a tuple of parts that do not stack"):
+        arranged("symlog", (np.ones(2),), to_numpy([[1.0, 2.0], [3.0]]))
     with pytest.raises(TypeError, match="observe: expected a dict of arrays, got a tuple of 3"):
         arranged("observe", (CONFIG,), (1, 2, 3))
 
