@@ -12,7 +12,7 @@ from typing import Any
 
 from conformance.adapter import COLUMNS, INTERFACE, OBJECTS, load_adapter
 from conformance.errors import UserError
-from conformance.foreign import ForeignAdapter
+from conformance.foreign import ForeignAdapter, as_edition
 from conformance.process import ProcessAdapter
 from conformance.serve import convert_arrays, load_file, to_numpy
 
@@ -32,14 +32,17 @@ class ModuleAdapter(ForeignAdapter):
         function = getattr(self._module, name)
         _require_arguments(name, function)
         convert = getattr(self._module, "convert", None)
-        result = function(*(convert_arrays(argument, convert) for argument in arguments))
+        try:
+            result = function(*(convert_arrays(argument, convert) for argument in arguments))
+        except SystemExit as error:  # not an Exception: it would end the kit, perhaps with exit code 0
+            raise RuntimeError(f"{name} called sys.exit({error.code!r})") from error
         try:
             return result if name in OBJECTS else to_numpy(result)
         except TypeError as error:
             raise TypeError(f"{name}: {error}") from error
 
     def edition(self) -> str | None:
-        return getattr(self._module, "edition", lambda: None)()
+        return as_edition(getattr(self._module, "edition", lambda: None)())
 
     @property
     def names(self) -> list[str]:
@@ -74,17 +77,27 @@ def load_candidate(name: str, dtype: str, device: str | None = None) -> object:
             raise UserError(f"{error}; install it with: pip install 'dreamer-spec[{name}]'") from error
         except (ValueError, RuntimeError) as error:
             raise UserError(str(error).partition("\n")[0]) from error
+    try:
+        return ModuleAdapter(_load_module(name), dtype)
+    except SystemExit as error:
+        raise UserError(f'{name} calls sys.exit({error.code!r}) when it is loaded; guard it with: if __name__ == "__main__"') from error
+
+
+def _load_module(name: str) -> ModuleType:
     if name.endswith(".py"):
-        if not Path(name).exists():
+        if not Path(name).is_file():
             raise UserError(f"no file {name}; `conformance new-adapter {name}` writes one to fill in")
-        return ModuleAdapter(load_file(Path(name)), dtype)
+        return load_file(Path(name))
+    unknown = UserError(f"no module named {name!r}; give one of {', '.join(COLUMNS)}, a module on PYTHONPATH, or a .py file")
+    if not all(part.isidentifier() for part in name.split(".")):
+        raise unknown
     sys.path.insert(0, "")
     try:
-        return ModuleAdapter(importlib.import_module(name), dtype)
+        return importlib.import_module(name)
     except ModuleNotFoundError as error:
         if error.name is None or not f"{name}.".startswith(f"{error.name}."):
             raise
-        raise UserError(f"no module named {name!r}; give one of {', '.join(COLUMNS)}, a module on PYTHONPATH, or a .py file") from error
+        raise unknown from error
 
 
 @contextlib.contextmanager

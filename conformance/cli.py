@@ -12,7 +12,7 @@ from conformance.errors import UserError
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Returns 0 when everything that was asked holds, 1 when it does not, 2 for a wrong command line."""
+    """Returns 0 when everything that was asked holds, 1 when it does not, 2 for a wrong command line, 130 after Ctrl-C."""
     parser = argparse.ArgumentParser(prog="conformance", description="Checks an implementation of DreamerV3 against the specification.")
     commands = parser.add_subparsers(dest="command", required=True)
     modules = {name.replace("_", "-"): importlib.import_module(f"conformance.commands.{name}") for name in COMMANDS}
@@ -27,6 +27,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except UserError as error:
         print(f"conformance: error: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        print("conformance: interrupted", file=sys.stderr)
+        return 130
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from conformance.adapter import INTERFACE, OBJECTS, RESULTS, Adapter
+from conformance.errors import UserError
 from spec import Config
 
 MAPPINGS = frozenset(
@@ -36,7 +37,11 @@ class ForeignAdapter(abc.ABC):
 
     @abc.abstractmethod
     def edition(self) -> str | None:
-        """The edition that the implementation claims."""
+        """The edition that the implementation claims.
+
+        Raises:
+          UserError: it claims something that is no name.
+        """
 
     def __getattr__(self, name: str) -> Any:
         if name not in INTERFACE or not self.offers(name):
@@ -47,6 +52,17 @@ class ForeignAdapter(abc.ABC):
             return result if name in OBJECTS else arranged(name, arguments, result)
 
         return function
+
+
+def as_edition(claim: Any) -> str | None:
+    """What an implementation returned as its edition.
+
+    Raises:
+      UserError: it is neither a name nor None.
+    """
+    if claim is not None and not isinstance(claim, str):
+        raise UserError(f"edition: expected a name or nothing, got {claim!r:.80}")
+    return claim
 
 
 def arranged(name: str, arguments: Sequence[Any], result: Any) -> Any:
@@ -65,7 +81,10 @@ def arranged(name: str, arguments: Sequence[Any], result: Any) -> Any:
     elif isinstance(result, Mapping):
         raise TypeError(f"{name}: expected one array, got {_kind(result)}: return the entry that is meant")
     elif isinstance(result, tuple):
-        result = np.asarray(result)
+        try:
+            result = np.asarray(result)
+        except ValueError as error:  # not one of ours: a ValueError says that an argument is refused
+            raise TypeError(f"{name}: expected one array, got a tuple of parts that do not stack") from error
 
     config = next((argument for argument in arguments if isinstance(argument, Config)), None)
     if name == "categorical_sample":

@@ -22,7 +22,7 @@ from typing import IO, Any
 
 from conformance.check import CandidateLost
 from conformance.errors import UserError
-from conformance.foreign import ForeignAdapter
+from conformance.foreign import ForeignAdapter, as_edition
 from conformance.serve import PROTOCOL, BadMessage, decode, encode, to_numpy
 
 RESTARTS = 5
@@ -120,7 +120,9 @@ class Connection:
         """With all that it has started, where the system has process groups."""
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(self.process.pid, signal.SIGKILL) if hasattr(os, "killpg") else self.process.kill()
-        self.process.wait()
+        with contextlib.suppress(subprocess.TimeoutExpired):  # a process of another user may outlive this
+            self.process.wait(timeout=2)
+        self._stdin.close()
 
     def _write(self, line: bytes) -> None:
         rest = memoryview(line)
@@ -129,22 +131,21 @@ class Connection:
                 rest = rest[self._stdin.write(rest) :]
 
     def _read_lines(self, stdout: IO[bytes]) -> None:
+        """Until there is more than can become a reply, so that nobody fills the memory."""
         pieces: list[bytes] = []
-        with contextlib.suppress(OSError, ValueError):
-            while chunk := stdout.read(2**20):
+        with contextlib.suppress(OSError, ValueError), stdout:
+            while self.partial <= MESSAGE_BYTES and self._lines.qsize() <= BABBLE_LINES + 1 and (chunk := stdout.read(2**20)):
                 *ends, rest = chunk.split(b"\n")
                 for end in ends:
                     self._lines.put(b"".join([*pieces, end]))
                     pieces, self.partial = [], 0
                 pieces.append(rest)
                 self.partial += len(rest)
-                if self.partial > MESSAGE_BYTES:
-                    break
         self._lines.put(None)
 
     def _read_errors(self, stderr: IO[bytes]) -> None:
         rest = b""
-        with contextlib.suppress(OSError, ValueError):
+        with contextlib.suppress(OSError, ValueError), stderr:
             while chunk := stderr.read(2**16):
                 *lines, rest = (rest + chunk)[-(2**16) :].split(b"\n")
                 self._errors.extend(line.decode(errors="replace") for line in lines)
@@ -159,8 +160,10 @@ class ProcessAdapter(ForeignAdapter):
         """command: as in a shell, but no shell runs it. timeout: seconds for each reply.
 
         Raises:
-          UserError: it cannot be started, or does not answer `start`.
+          UserError: it cannot be started, or does not answer `start`; or the timeout is not above 0.
         """
+        if not timeout > 0:
+            raise UserError(f"--timeout: expected seconds above 0, got {timeout:g}")
         try:
             self._command = shlex.split(command)
         except ValueError as error:
@@ -173,9 +176,13 @@ class ProcessAdapter(ForeignAdapter):
         self._babble = 0
         try:
             started = self._start()
-        except (CandidateLost, CandidateError, ValueError, KeyError) as error:
-            raise UserError(" | ".join(str(error).splitlines())) from error
-        self.name, self.version = str(started["name"]), str(started["version"])
+        except CandidateLost as error:
+            raise UserError(_in_one_line(error)) from error
+        except BaseException:
+            self.close()
+            raise
+        self.name: str = started["name"]
+        self.version: str = started["version"]
         self.names: list[str] = started["functions"]
 
     def offers(self, name: str) -> bool:
@@ -186,26 +193,29 @@ class ProcessAdapter(ForeignAdapter):
         result = self._ask("run", function=name, args=[encode_argument(argument) for argument in arguments])
         try:
             return to_numpy(decode(result))
-        except (BadMessage, TypeError) as error:
+        except (BadMessage, TypeError, RecursionError) as error:
             raise CandidateError(f"{name}: {error}") from error
 
     def edition(self) -> str | None:
-        edition = self._ask("edition")
-        if edition is not None and not isinstance(edition, str):
-            raise CandidateError(f"edition: expected a name or null, got {edition!r:.80}")
-        return edition
+        try:
+            return as_edition(self._ask("edition"))
+        except (CandidateLost, CandidateError, ValueError, KeyError) as error:
+            raise UserError(f"edition: {_in_one_line(error)}") from error
 
     def close(self) -> None:
         """Ends the process: with `stop`, and after two seconds by force."""
         if self._connection is None:
             return
-        with contextlib.suppress(TimeoutError):
-            self._connection.send({"id": self._requests + 1, "method": "stop"})
+        connection, self._connection = self._connection, None
+        try:
+            connection.send({"id": self._requests + 1, "method": "stop"})
             deadline = time.monotonic() + min(2.0, self._timeout)
-            while self._connection.receive(deadline) is not None:
+            while connection.receive(deadline) is not None:
                 pass
-        self._connection.kill()
-        self._connection = None
+        except TimeoutError:
+            pass
+        finally:
+            connection.kill()
 
     def _start(self) -> Mapping[str, Any]:
         if self._starts > RESTARTS:
@@ -216,9 +226,11 @@ class ProcessAdapter(ForeignAdapter):
             self._connection = Connection(self._command)
         except (OSError, IndexError) as error:
             raise CandidateLost(f"cannot run {shlex.join(self._command)!r}: {error}") from error
-        started = self._exchange("start", {"protocol": PROTOCOL, "dtype": self._dtype})
-        problem = _problem_of_start(started)
-        if problem:
+        try:
+            started = self._exchange("start", {"protocol": PROTOCOL, "dtype": self._dtype})
+        except (CandidateError, ValueError, KeyError) as error:
+            raise self._lost("start", str(error)) from error
+        if problem := _problem_of_start(started):
             raise self._lost("start", problem)
         return dict(started)
 
@@ -260,7 +272,7 @@ class ProcessAdapter(ForeignAdapter):
                 raise self._lost(what, self._why_ended())
             try:
                 message = json.loads(line)
-            except ValueError:
+            except (ValueError, RecursionError):
                 message = None
             if isinstance(message, dict) and "id" in message:
                 return message
@@ -287,11 +299,18 @@ class ProcessAdapter(ForeignAdapter):
         return CandidateLost("\n".join([f"the process was lost at {what}: {reason}", *shown]))
 
 
+def _in_one_line(error: BaseException) -> str:
+    return " | ".join(str(error).splitlines())
+
+
 def _problem_of_start(started: Any) -> str:
     if not isinstance(started, dict) or started.keys() != {"protocol", "name", "version", "functions"}:
         return f"expected protocol, name, version and functions, got {started!r:.80}"
     if started["protocol"] != PROTOCOL:
         return f"it speaks protocol {started['protocol']!r}, and the kit {PROTOCOL}"
+    for name in ("name", "version"):
+        if not isinstance(started[name], str):
+            return f"expected the {name} as text, got {started[name]!r:.80}"
     functions = started["functions"]
     if not isinstance(functions, list) or not all(isinstance(name, str) for name in functions):
         return f"expected the names of the functions as a list of text, got {functions!r:.80}"

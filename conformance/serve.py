@@ -187,6 +187,7 @@ def load_file(path: Path) -> Any:
     if specification is None or specification.loader is None:
         raise ImportError(f"{path} is not a Python file")
     module = importlib.util.module_from_spec(specification)
+    sys.modules.setdefault(path.stem, module)  # where dataclasses look up the names of their annotations
     specification.loader.exec_module(module)
     return module
 
@@ -194,10 +195,12 @@ def load_file(path: Path) -> Any:
 def main() -> None:
     if len(sys.argv) != 2:
         sys.exit("usage: python -m conformance.serve my_adapter.py")
-    # Replies have the pipe to themselves: what anything else prints, C libraries included, goes to standard error.
-    replies = os.fdopen(os.dup(1), "wb")
+    # Messages have the pipes to themselves: what anything else prints, C libraries included, goes to standard error, and what
+    # anything else reads, programs that the adapter starts included, is empty.
+    requests, replies = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
+    os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
     os.dup2(2, 1)
-    serve(load_file(Path(sys.argv[1])), sys.stdin.buffer, replies)
+    serve(load_file(Path(sys.argv[1])), requests, replies)
 
 
 if __name__ == "__main__":

@@ -42,7 +42,7 @@ def result_of(request):
     if request["method"] == "start":
         return {"protocol": 1, "name": "fake", "version": "0.1", "functions": ["symlog", "kl_losses", "an_extra"]}
     if request["method"] == "edition":
-        return "official"
+        return 3 if MODE == "odd edition" else "official"
     if request["method"] == "run":
         if request["function"] == "kl_losses":  # what came, as it came
             return {"map": {"dynamics": request["args"][0], "representation": request["args"][1]}}
@@ -52,8 +52,10 @@ def result_of(request):
 
 def reply_to(request):
     reply = {"id": request["id"], "result": result_of(request)}
-    if request["method"] == "run" and MODE in ERRORS:
+    if (MODE in ERRORS and request["method"] == "run") or f"refuses {request['method']}" == MODE:
         reply = {"id": request["id"], "error": {"kind": MODE, "message": "fake refuses x"}}
+    if MODE == "odd edition":
+        return json.dumps(reply)
     VALIDATORS["error_reply" if "error" in reply else f"{request['method']}_reply"].validate(reply)
     return json.dumps(reply)
 
@@ -75,6 +77,9 @@ def misbehave(reply):
         sys.exit(0)
     if MODE == "half line and hang":
         write(reply[: len(reply) // 2])
+        time.sleep(600)
+    if MODE == "deep and hang":
+        write("[" * 100_000 + "\n")
         time.sleep(600)
     if MODE == "close":
         os.close(1)
@@ -119,6 +124,8 @@ def main():
             write(reply + "\n")
         if request["method"] == "run" and MODE == "stops reading":
             time.sleep(600)
+        while request["method"] == "start" and MODE == "flood":
+            write("nothing\n" * 10_000)
         if request["method"] == "stop":
             return
 

@@ -97,6 +97,8 @@ def test_several_results_come_in_any_dress() -> None:
             arranged("kl_losses", losses, to_numpy(result))
     with pytest.raises(TypeError, match="symlog: expected one array, got a dict with the keys 'x'"):
         arranged("symlog", (np.ones(2),), {"x": np.ones(2)})
+    with pytest.raises(TypeError, match="symlog: expected one array, got a tuple of parts that do not stack"):
+        arranged("symlog", (np.ones(2),), to_numpy([[1.0, 2.0], [3.0]]))
     with pytest.raises(TypeError, match="observe: expected a dict of arrays, got a tuple of 3"):
         arranged("observe", (CONFIG,), (1, 2, 3))
 
@@ -182,9 +184,40 @@ def test_setup_and_what_an_adapter_says_of_itself() -> None:
     assert remarks(load_adapter("numpy")) == []
 
 
+def test_an_edition_is_a_name() -> None:
+    with pytest.raises(UserError, match="edition: expected a name or nothing, got 3"):
+        module(edition=lambda: 3).edition()
+
+
 def test_an_adapter_that_is_not_there(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match=r"conformance new-adapter .*mine\.py"):
-        candidate.load_candidate(str(tmp_path / "mine.py"), "float64")
+    (tmp_path / "folder.py").mkdir()
+    for name in ("mine.py", "folder.py"):
+        with pytest.raises(UserError, match=rf"conformance new-adapter .*{name}"):
+            candidate.load_candidate(str(tmp_path / name), "float64")
+    for name in ("no_such_module", "./adapter", "..", "my adapter", ""):
+        with pytest.raises(UserError, match="no module named"):
+            candidate.load_candidate(name, "float64")
+
+
+def test_an_adapter_with_a_dataclass(tmp_path: Path) -> None:
+    """Annotations as text are looked up in the module, by its name."""
+    source = "from __future__ import annotations\nimport dataclasses\n\n\n@dataclasses.dataclass\nclass Losses:\n    dynamics: float\n"
+    (tmp_path / "with_a_dataclass.py").write_text(source, encoding="utf-8")
+    assert load_file(tmp_path / "with_a_dataclass.py").Losses(1.0).dynamics == 1
+
+
+def test_an_adapter_does_not_end_the_kit(tmp_path: Path) -> None:
+    """Least of all with exit code 0."""
+
+    def leave(x: Any) -> Any:
+        raise SystemExit(0)
+
+    result = run("transforms.symlog_matches", module(symlog=leave))
+    assert result.status == "error"
+    assert "symlog called sys.exit(0)" in result.message
+    (tmp_path / "script.py").write_text("import sys\nsys.exit(0)\n", encoding="utf-8")
+    with pytest.raises(UserError, match=r"script\.py calls sys\.exit\(0\) when it is loaded"):
+        candidate.load_candidate(str(tmp_path / "script.py"), "float64")
 
 
 # --- A stranger --------------------------------------------------------------------------------------------------------------------------

@@ -17,7 +17,7 @@ from conformance.cli import main
 from conformance.errors import UserError
 from conformance.lockstep import run
 from conformance.lockstep.bounds import bound
-from conformance.lockstep.drift import GROUPS, Tensor, beyond_one, deviations, of_the_way
+from conformance.lockstep.drift import GROUPS, Tensor, beyond_one, deviations, of_the_way, share_of_others
 from conformance.lockstep.report import failures, interval_ends, reduce, report
 from conformance.lockstep.run import Lockstep
 from conformance.lockstep.stream import Stream, lockstep_config
@@ -199,7 +199,7 @@ def test_noise_keeps_its_distance_from_the_thresholds(torch_backend: Any, monkey
     assert lockstep.redrawn > 0
     monkeypatch.setitem(run.MARGIN, "float64", 0.5)
     monkeypatch.setattr(run, "ATTEMPTS", 3)
-    with pytest.raises(RuntimeError, match=r"no noise of 3 keeps every sample 0\.5 away"):
+    with pytest.raises(UserError, match=r"step 1: no noise of 3 keeps every sample 0\.5 away .* state of torch"):
         lockstep._noise(lockstep._start, batch)
 
 
@@ -213,6 +213,8 @@ def test_deviation_is_relative_to_the_way() -> None:
     assert of_the_way([1e-30], [0.0], [0.0]) == math.inf
     assert of_the_way([np.nan], [1.0], [0.0]) == math.inf
     assert of_the_way([1.0], [1.0, 1.0], [0.0, 0.0]) == math.inf
+    assert share_of_others([[1, 0], [0, 1]], [[1, 0], [1, 0]]) == 0.5
+    assert share_of_others([0, 1], [[1, 0], [1, 0]]) == math.inf
     assert beyond_one([0.5, 0.0], [0.25, 0.0]) == 0.25
     assert beyond_one([12.0], [10.0]) == 0.2
     assert beyond_one(np.nan, 1.0) == math.inf
@@ -244,6 +246,24 @@ def test_a_result_that_lacks_something_is_an_error(torch_backend: Any) -> None:
     lockstep = Lockstep({"torch": torch_backend, "poor": Wrapped(torch_backend, poor)}, "vector", "paper", "float64", 0)
     with pytest.raises(UserError, match="poor: the result of a train step lacks 'deter'"):
         lockstep.step()
+    lockstep = Lockstep({"poor": Wrapped(torch_backend, poor), "torch": torch_backend}, "vector", "paper", "float64", 0)
+    with pytest.raises(UserError, match="poor: the result of a train step lacks 'deter'"):
+        lockstep.step()
+
+
+def test_a_member_that_writes_into_its_arguments_changes_nobody_elses_step(torch_backend: Any) -> None:
+    def writing(right: Any, state: Any, batch: Any, noise: Any, *rest: Any) -> Any:
+        result = right(state, batch, noise, *rest)
+        for array in (*state["params"].values(), *state["slow_critic"].values(), *noise.values(), batch["reward"]):
+            array[...] = 0
+        return result
+
+    members = {"torch": torch_backend, "writing": Wrapped(torch_backend, writing), "same": torch_backend}
+    lockstep = Lockstep(members, "vector", "paper", "float64", 0)
+    for _ in range(2):
+        lockstep.step()
+    assert failures(lockstep) == []
+    assert max(lockstep.comparisons["same"]["one step"].worst["rssm"][1].deviation, 0.0) == 0
 
 
 @pytest.mark.parametrize(("observation", "action"), list(run.PROBLEMS.values()))
@@ -296,6 +316,7 @@ def test_every_group_has_tensors(together: Lockstep) -> None:
         (["--steps", "0"], "--steps: expected 1 or more, got 0"),
         (["--problems", "sound"], "'sound'; known: vector, image"),
         (["--backends", "numpy,no_such_module"], "no_such_module"),
+        (["--out", f"{__file__}/below/a/file"], "below/a/file: Not a directory"),
     ],
 )
 def test_wrong_command_lines(arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:

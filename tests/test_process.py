@@ -121,6 +121,8 @@ BROKEN = {
     "neither": ("either a result or an error", "answer"),
     "error without a message": ("either a result or an error",),
     "huge line": ("a line is longer than 1,000,000 bytes",),
+    "deep and hang": ("no reply within 0.5 s",),
+    "flood": ("more than 100 lines on standard output are no messages, the last: 'nothing'",),
 }
 
 
@@ -192,11 +194,33 @@ def test_a_process_that_does_not_read_is_no_hang() -> None:
         assert time.monotonic() - before < 30
 
 
-def test_a_process_that_does_not_stop_is_ended() -> None:
-    with fake("does not stop") as adapter:
+@pytest.mark.parametrize("mode", ["does not stop", "flood"])
+def test_a_process_that_does_not_stop_is_ended(mode: str) -> None:
+    with fake(mode) as adapter:
         running = adapter._connection
         assert running is not None
-    assert running.process.poll() == -9
+    assert running.process.poll() is not None
+    assert running._lines.qsize() < 100_000, "what is not asked for fills the memory"
+
+
+def test_ctrl_c_while_waiting_for_the_end_ends_the_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    with fake() as adapter:
+        running = adapter._connection
+        assert running is not None
+
+        def interrupted(deadline: float) -> None:
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr(running, "receive", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            adapter.close()
+    assert running.process.poll() is not None
+
+
+@pytest.mark.parametrize(("mode", "message"), [("odd edition", "expected a name or nothing, got 3"), ("refuses edition", "fake refuses x")])
+def test_an_edition_that_is_none(mode: str, message: str) -> None:
+    with fake(mode) as adapter, pytest.raises(UserError, match=f"^edition: .*{message}"):
+        adapter.edition()
 
 
 @pytest.mark.parametrize(
@@ -205,6 +229,7 @@ def test_a_process_that_does_not_stop_is_ended() -> None:
         (command("dies at once"), "ended with exit code 1 | its standard error ended with: | no such licence"),
         (command("old protocol"), "it speaks protocol 0, and the kit 1"),
         (command("reads nothing"), "no reply within 0.5 s"),
+        (command("refuses start"), "the process was lost at start: refuses start: fake refuses x"),
         ("no-such-program --now", "cannot run 'no-such-program --now'"),
         ("", "cannot run ''"),
         ("python 'unfinished", "No closing quotation"),
@@ -215,6 +240,12 @@ def test_a_process_that_does_not_start(line: str, message: str) -> None:
         ProcessAdapter(line, "float64", 0.5 if "reads nothing" in line else 60.0)
     assert message in str(raised.value)
     assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("timeout", [0.0, -1.0, math.nan])
+def test_a_timeout_is_a_time(timeout: float) -> None:
+    with pytest.raises(UserError, match="--timeout: expected seconds above 0, got"):
+        ProcessAdapter(command(), "float64", timeout)
 
 
 def test_the_command_line(capsys: pytest.CaptureFixture[str]) -> None:
@@ -228,6 +259,7 @@ def test_the_command_line(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 ADAPTER = """
+import subprocess
 import numpy as np
 print("hello from the import")
 __version__ = "1.5"
@@ -243,6 +275,7 @@ def edition():
 
 def symlog(x):
     print("a print in the middle")
+    assert subprocess.run(["cat"], capture_output=True).stdout == b"", "requests are read by the server alone"
     return np.sign(x) * np.log1p(np.abs(x))
 
 

@@ -247,9 +247,26 @@ def test_only_an_older_set_is_replaced(tmp_path: Path) -> None:
     assert (tmp_path / "thesis.json").read_text() == "mine"
     with pytest.raises(UserError, match="no vectors in"):
         read_index(tmp_path)
-    (tmp_path / "index.json").write_text('{"format": 99}')
+    for index in ('{"format": 99, "files": {}}', '{"routes": []}', "[]", "3", "no JSON"):  # other programs write files of this name, too
+        (tmp_path / "index.json").write_text(index)
+        with pytest.raises(UserError, match="holds other things than vectors"):
+            write_vectors(tmp_path, "minimal", "paper", 0, "TRA-3")
+    assert (tmp_path / "thesis.json").read_text() == "mine"
+    (tmp_path / "thesis.json").unlink()
+    (tmp_path / "index.json").write_text('{"format": 99, "files": {"old.json": {}}}')
+    (tmp_path / "old.json").write_text("{}")
     with pytest.raises(UserError, match="format 99, expected 1"):
         read_index(tmp_path)
+    write_vectors(tmp_path, "minimal", "paper", 0, "TRA-3")
+    assert {path.name for path in tmp_path.iterdir()} == {"index.json", "transforms.json", "transforms.npz"}
+
+
+def test_where_nothing_can_be_written(tmp_path: Path) -> None:
+    """It is said before the checks are recorded."""
+    (tmp_path / "file").write_text("")
+    for place in (tmp_path / "file", tmp_path / "file" / "vectors"):
+        with pytest.raises(UserError, match=f"cannot write {place}: "):
+            write_vectors(place, "minimal", "paper", 0, "TRA-3")
 
 
 def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

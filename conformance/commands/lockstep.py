@@ -42,6 +42,7 @@ def main(console: Console, options: argparse.Namespace) -> int:
         raise UserError(f"--problems: there is no {unknown[0]!r}; known: {', '.join(PROBLEMS)}")
     if options.out:
         figure_class()
+        _make_folder(options.out)
     members = {name: load_candidate(name, options.dtype) for name in options.backends.split(",") if name}
     locksteps = {problem: Lockstep(members, problem, options.profile, options.dtype, options.seed) for problem in problems}
     begin = time.monotonic()
@@ -62,6 +63,14 @@ def main(console: Console, options: argparse.Namespace) -> int:
     elif finished and not lines:
         console.print(f"every tensor stayed within its bound for {options.steps} steps")
     return 0 if finished and not lines else 1
+
+
+def _make_folder(path: Path) -> None:
+    """Before the run, which may take minutes."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"cannot write {path}: {error.strerror}") from error
 
 
 def _run(console: Console, locksteps: dict[str, Lockstep], steps: int) -> None:

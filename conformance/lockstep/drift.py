@@ -38,8 +38,7 @@ def deviations(actual: tuple[Nested, Nested], expected: tuple[Nested, Nested], o
       KeyError: a result lacks something.
     """
     (state, aux), (expected_state, expected_aux) = actual, expected
-    differing = np.any(np.round(aux["stoch"]) != np.round(expected_aux["stoch"]), -1)
-    yield Tensor("samples", "rssm", "posterior samples", float(np.mean(differing)))
+    yield Tensor("samples", "rssm", "posterior samples", share_of_others(aux["stoch"], expected_aux["stoch"]))
     yield Tensor("latents", "rssm", "deter", beyond_one(aux["deter"], expected_aux["deter"]))
     for name, loss in expected_aux["losses"].items():
         yield Tensor("losses", name.partition("/")[0], f"loss {name}", beyond_one(aux["losses"][name], loss))
@@ -57,6 +56,13 @@ def _tensors(group: str | None, prefix: str, actual: Nested, expected: Nested, o
     for name, value in expected.items():
         part = name.partition("/")[0]
         yield Tensor(group or part, part, f"{prefix}/{name}", of_the_way(actual[name], value, origin[name]))
+
+
+def share_of_others(actual: Any, expected: Any) -> float:
+    """Of the one-hot samples [..., C], the share that is of another class; infinite where shapes differ."""
+    if np.shape(actual) != np.shape(expected):
+        return math.inf
+    return float(np.mean(np.any(np.round(actual) != np.round(expected), -1)))
 
 
 def of_the_way(actual: Any, expected: Any, origin: Any) -> float:

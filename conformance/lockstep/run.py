@@ -1,8 +1,10 @@
 """The lockstep itself: every member makes the same train steps, and after each the results are compared."""
 
+import contextlib
+import copy
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -114,23 +116,21 @@ class Lockstep:
         self._stream.store(expected[1]["deter"], expected[1]["stoch"])
 
     def _compare(self, comparison: Comparison, name: str, actual: Any, expected: Any, origin: Nested, together: int) -> None:
-        try:
+        with _complete(name):
             tensors = list(deviations(actual, expected, origin))
-        except KeyError as error:
-            raise UserError(
-                f"{name}: the result of a train step lacks {error}; [AGT] in spec/10-agent.md says what belongs there"
-            ) from error
         comparison.add(self.steps, tensors, lambda tensor: bound(tensor, together, self.dtype))
 
     def _advance(self, name: str, state: Nested, batch: Arrays, noise: Arrays) -> tuple[Nested, Nested]:
         adapter: Any = self.members[name]
+        inputs = copy.deepcopy((state, batch, noise))  # a member that writes into them changes nobody else's step
         if callable(getattr(adapter, "train_step", None)):
-            new, aux = adapter.train_step(state, batch, noise, self.task, self.config)
+            new, aux = adapter.train_step(*inputs, self.task, self.config)
         else:
             supplier: Any = self.supplier
-            gradients = supplier.gradients(*self._loss_arguments(state, batch, noise))
-            new, aux = adapter.train_step_with(state, batch, noise, gradients, self.task, self.config)
-        return _plain(new), aux
+            gradients = supplier.gradients(*self._loss_arguments(*copy.deepcopy(inputs)))
+            new, aux = adapter.train_step_with(*inputs, gradients, self.task, self.config)
+        with _complete(name):
+            return _plain(new), {key: aux[key] for key in ("losses", "deter", "stoch")}
 
     def _noise(self, state: Nested, batch: Arrays) -> tuple[Arrays, list[np.ndarray]]:
         """Noise with which no sample at this state lies near a threshold, and the samples."""
@@ -140,7 +140,10 @@ class Lockstep:
             if margin >= MARGIN[self.dtype]:
                 return noise, samples
             self.redrawn += 1
-        raise RuntimeError(f"no noise of {ATTEMPTS} keeps every sample {MARGIN[self.dtype]:g} away from the next class")
+        raise UserError(
+            f"step {self.steps + 1}: no noise of {ATTEMPTS} keeps every sample {MARGIN[self.dtype]:g} away from the next class; "
+            f"does the state of {self.baseline} hold numbers that are not finite?"
+        )
 
     def _samples(self, state: Nested, batch: Arrays, noise: Arrays) -> tuple[list[np.ndarray], float]:
         """Every categorical sample that the reference draws at a state, imagined ones as well, and the smallest distance of a uniform
@@ -172,10 +175,21 @@ class Lockstep:
         return agent.initial_state({name: round_to(value, stored) for name, value in params.items()})
 
 
+@contextlib.contextmanager
+def _complete(name: str) -> Iterator[None]:
+    """Raises UserError where a member's result lacks something."""
+    try:
+        yield
+    except KeyError as error:
+        raise UserError(f"{name}: the result of a train step lacks {error}; [AGT] in spec/10-agent.md says what belongs there") from error
+
+
 def _plain(state: Nested) -> Nested:
     """The state with the count of updates and the return range as plain numbers, whatever the backend holds them in."""
+    optimizer = state["optimizer"]
     return {
-        **state,
-        "optimizer": {**state["optimizer"], "step": int(state["optimizer"]["step"])},
-        "return_range": {end: float(value) for end, value in state["return_range"].items()},
+        "params": state["params"],
+        "slow_critic": state["slow_critic"],
+        "optimizer": {**{key: optimizer[key] for key in ("second_moment", "momentum")}, "step": int(optimizer["step"])},
+        "return_range": {end: float(state["return_range"][end]) for end in ("low", "high")},
     }

@@ -117,7 +117,7 @@ MUTANTS = (
         explanation="the KL runs from prior to posterior",
         provenance="plausible: the arguments of a library in the other order",
         violates=("WM-10",),
-        fix="Take the KL of the prior from the posterior, in both losses.",
+        fix="The posterior comes first: KL(posterior, prior), in both losses.",
         edits={
             "world_model.kl_losses": {
                 _DYNAMICS: "categorical_kl(prior, stop_gradient(posterior)).sum(axis=-1)",

@@ -45,9 +45,9 @@ def read_index(directory: Path) -> dict[str, Any]:
     """
     try:
         index: dict[str, Any] = json.loads((directory / "index.json").read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
+    except (OSError, ValueError) as error:
         raise UserError(
-            f"no vectors in {directory}: it has no index.json; write some with: conformance vectors --out {directory}"
+            f"no vectors in {directory}: it has no index.json that can be read; write some with: conformance vectors --out {directory}"
         ) from error
     if index.get("format") != FORMAT:
         raise UserError(f"{directory} has vectors of the format {index.get('format')!r}, expected {FORMAT}; write them anew")

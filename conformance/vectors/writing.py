@@ -1,8 +1,10 @@
 """Writes a set of vectors."""
 
+import contextlib
 import dataclasses
 import hashlib
 import importlib.metadata
+import json
 import tomllib
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
@@ -57,12 +59,14 @@ def write_vectors(
     """Writes a set and returns its index. The same arguments and versions give the same bytes.
 
     Raises:
-      UserError: no check matches `only`, or the directory holds something else.
+      UserError: no check matches `only`; or the directory holds something else, or cannot be written.
     """
     checks = checks_to_record(only)
     if not checks:
         raise UserError(f"no check matches --only {only!r}")
-    old = _of_older_set(directory)
+    with _writing(directory):
+        directory.mkdir(parents=True, exist_ok=True)
+        old = _of_older_set(directory)
     files: dict[str, bytes] = {}
     names: dict[str, list[str]] = {}
     left_out: list[dict[str, Any]] = []
@@ -90,11 +94,11 @@ def write_vectors(
         "files": {name: _about(content) | ({"cases": names[name]} if name in names else {}) for name, content in files.items()},
         "left_out": left_out,
     }
-    directory.mkdir(parents=True, exist_ok=True)
-    for path in old:
-        path.unlink()
-    for name, content in {**files, "index.json": to_json(index)}.items():
-        (directory / name).write_bytes(content)
+    with _writing(directory):
+        for path in old:
+            path.unlink()
+        for name, content in {**files, "index.json": to_json(index)}.items():
+            (directory / name).write_bytes(content)
     return index
 
 
@@ -173,18 +177,33 @@ def _about(content: bytes) -> dict[str, Any]:
     return {"sha256": hashlib.sha256(content).hexdigest(), "bytes": len(content)}
 
 
+@contextlib.contextmanager
+def _writing(directory: Path) -> Iterator[None]:
+    """Raises UserError where the directory cannot be written."""
+    try:
+        yield
+    except OSError as error:
+        raise UserError(f"cannot write {directory}: {error.strerror}") from error
+
+
 def _of_older_set(directory: Path) -> list[Path]:
     """The files of the set that the directory holds.
 
     Raises:
       UserError: it holds something else.
     """
-    if directory.exists() and not directory.is_dir():
-        raise UserError(f"{directory} is a file; give a directory")
-    there = list(directory.iterdir()) if directory.exists() else []
-    if there and not (directory / "index.json").exists():
+    there = list(directory.iterdir())
+    if there and not {path.name for path in there} <= _named_in_index(directory):
         raise UserError(f"{directory} holds other things than vectors; give an empty or a new directory")
-    return [path for path in there if path.suffix in (".json", ".npz")]
+    return there
+
+
+def _named_in_index(directory: Path) -> set[str]:
+    """index.json and the files that it names; none where it is no index of vectors."""
+    try:
+        return {"index.json", *json.loads((directory / "index.json").read_text(encoding="utf-8"))["files"]}
+    except (OSError, ValueError, TypeError, KeyError):
+        return set()
 
 
 def _row(check: Check) -> str:
