@@ -208,6 +208,16 @@ def test_a_step_that_is_saved_again_is_never_without_a_checkpoint(make: Make, mo
     assert found.info["replay"]
 
 
+def test_what_a_killed_save_left_does_not_stop_the_next_one(make: Make) -> None:
+    with ExitStack() as stack:
+        state = setup.prepare(make(), FakeLearner, stack)
+        loop.train(state)
+        path = save(state)
+        shutil.copytree(path, path.with_suffix(".old"))
+        save(state)
+    assert [entry.name for entry in path.parent.iterdir()] == [path.name]
+
+
 @pytest.mark.parametrize("name", ["learner.safetensors", "loop.safetensors", "run.json", "SHA256SUMS", "replay"])
 @pytest.mark.parametrize("damage", ["cut off", "a flipped bit", "missing"])
 def test_a_damaged_checkpoint_falls_back_to_the_one_before(make: Make, name: str, damage: str, capsys: pytest.CaptureFixture[str]) -> None:

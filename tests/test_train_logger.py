@@ -1,5 +1,6 @@
 """What a run writes: metrics.jsonl cut back to a checkpoint, TensorBoard, Weights & Biases; and what it shows."""
 
+import errno
 import io
 import json
 import math
@@ -103,6 +104,19 @@ def test_a_full_disk_is_a_user_error(tmp_path: Path) -> None:
     logger._file = Path("/dev/full").open("ab")  # noqa: SIM115
     with pytest.raises(UserError, match=r"cannot write .*metrics.jsonl: No space left"):
         logger.write(1, 0.0, {"a": 1.0})
+    with pytest.raises(UserError, match=r"cannot write .*: No space left"):
+        logger.close()
+
+
+def test_a_full_disk_under_tensorboard_is_a_user_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    logger = Logger(tmp_path)
+    monkeypatch.setattr(logger._tensorboard._writer, "add_event", refuse)
+    with pytest.raises(UserError, match=rf"cannot write {tmp_path}: No space left"):
+        logger.write(1, 0.0, {"a": 1.0})
+    logger.close()
 
 
 def test_damaged_lines_are_left_out(tmp_path: Path) -> None:

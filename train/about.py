@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from spec import Config, Spaces, load_config, profiles, sizes
-from train.errors import UserError
+from train.errors import writing
 from train.machine import describe
 from train.options import Options, presets
 
@@ -118,11 +118,9 @@ def _show(value: Any) -> str:
 
 def _write(path: Path, text: str) -> None:
     temporary = path.with_suffix(".tmp")
-    try:
+    with writing(path):
         with temporary.open("w", encoding="utf-8") as file:
             file.write(text)
             file.flush()
             os.fsync(file.fileno())
         temporary.replace(path)
-    except OSError as error:
-        raise UserError(f"cannot write {path}: {error.strerror}") from error

@@ -8,7 +8,6 @@ import statistics
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -17,7 +16,7 @@ from train.backend import Learner
 from train.checkpoint import open_checkpoint
 from train.cli import Parser
 from train.envs import Environments, Record, is_slow, make_env
-from train.errors import UserError
+from train.errors import UserError, writing
 from train.evaluation import Agent, Episode, play_episodes
 from train.options import Options
 from train.saved_agent import SavedAgent, agent_of
@@ -70,7 +69,8 @@ def main(arguments: Sequence[str]) -> int:
         run = {"checkpoint": str(checkpoint.path), "task": options.task, "step": saved.info["step"], "trained_by": saved.info["backend"]}
         run |= {"backend": options.backend, "device": learner.device, "seed": values.seed}
         lists = {"returns": [episode.score for episode in episodes], "lengths": [episode.length for episode in episodes]}
-        _write(values.json, {**run, **summary, **lists})
+        with writing(values.json):
+            values.json.write_text(json.dumps({**run, **summary, **lists}, indent=2) + "\n", encoding="utf-8")
     return 0
 
 
@@ -147,10 +147,3 @@ def _task_without_code(saved: SavedAgent) -> str:
     if suite in ("gym", "dmc", "dmc_vision") and ":" not in name:
         return task
     raise UserError(f"the checkpoint names the task {task}, which runs code of that module; if you trust it, add --task {task}")
-
-
-def _write(path: Path, content: Mapping[str, Any]) -> None:
-    try:
-        path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"cannot write {path}: {error.strerror}") from error
