@@ -167,6 +167,17 @@ def test_resume_never_and_must(make: Make, resume: str) -> None:
         loop.run(make(resume=resume), FakeLearner)
 
 
+def test_two_runs_do_not_share_a_log_directory(make: Make) -> None:
+    with ExitStack() as stack:
+        state = setup.prepare(make(), FakeLearner, stack)
+        state.logger.write(1, 0.0, {"a": 1.0})
+        written = (make().logdir / "metrics.jsonl").read_bytes()
+        with pytest.raises(UserError, match="another process is training in"):
+            loop.run(make(), FakeLearner)
+        assert (make().logdir / "metrics.jsonl").read_bytes() == written
+    assert loop.run(make(), FakeLearner)
+
+
 @pytest.mark.covers("LOOP-22")
 def test_a_checkpoint_is_complete_or_absent(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     loop.run(make(), FakeLearner)
