@@ -343,23 +343,38 @@ def test_the_first_interrupt_saves(make: Make, monkeypatch: pytest.MonkeyPatch) 
     assert signal.getsignal(signal.SIGINT) is handler
 
 
-def test_an_interrupt_abandons_an_evaluation(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Evaluation is due at step 20, after 10 policy steps; the signal comes in its second step."""
+@pytest.mark.covers("LOOP-23")
+@pytest.mark.parametrize("policy_step", [9, 11], ids=["in the step before", "in its second step"])
+def test_an_evaluation_that_was_interrupted_is_made_up_for(make: Make, monkeypatch: pytest.MonkeyPatch, policy_step: int) -> None:
+    """Evaluation is due at step 20, after 10 policy steps. Metrics are then those of a run in one go."""
+    options = make(task="gym:CartPole-v1", eval_every=20, eval_episodes=4)
+    whole = dataclasses.replace(options, logdir=options.logdir / "whole")
+    loop.run(whole, FakeLearner)
+    FakeLearner.diary.clear()
     policy = FakeLearner.policy
 
     def interrupt(self: FakeLearner, *arguments: Any) -> Any:
-        if sum(kind == "policy" for kind, _ in FakeLearner.diary) == 11:
+        if sum(kind == "policy" for kind, _ in FakeLearner.diary) == policy_step:
             os.kill(os.getpid(), signal.SIGINT)
         return policy(self, *arguments)
 
-    monkeypatch.setattr(FakeLearner, "policy", interrupt)
-    options = make(eval_every=20, eval_episodes=40)
-    assert not loop.run(options, FakeLearner)
+    with monkeypatch.context() as patch:
+        patch.setattr(FakeLearner, "policy", interrupt)
+        assert not loop.run(options, FakeLearner)
     saved = checkpoint.open_checkpoint(options.logdir)
-    assert saved
     assert saved.info["counters"]["records"] == 20
     assert (saved.info["counters"]["evaluations"], saved.info["evaluation"]) == (0, None)
     assert not any("evaluation/return" in line for line in read_metrics(options.logdir / "metrics.jsonl"))
+    assert loop.run(options, FakeLearner)
+    lines, expected = (
+        [
+            {name: value for name, value in line.items() if name != "seconds" and not name.startswith(("speed/", "time/", "memory/"))}
+            for line in read_metrics(logdir / "metrics.jsonl")
+        ]
+        for logdir in (options.logdir, whole.logdir)
+    )
+    assert [line["step"] for line in expected if "evaluation/return" in line] == [20, 40, 60]
+    assert lines == expected
 
 
 def test_what_ends_the_last_evaluation_does_not_cost_the_training(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -40,6 +40,7 @@ def train(run: Run) -> bool:
     """Acts, remembers and learns until the budget of steps is used up. Returns False if Ctrl-C ended it; then a checkpoint is written."""
     schedule = Schedule(run)
     with _interruptible(run.interrupted):
+        schedule.evaluate(run)
         while run.step < run.options.steps and not run.interrupted:
             act(run)
             schedule.attend(run)

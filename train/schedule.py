@@ -26,7 +26,6 @@ class Schedule:
     def __init__(self, run: Run) -> None:
         self._clock = self._logged_at = self._saved_at = time.monotonic()
         self._logged = dataclasses.replace(run.counters)
-        self._evaluations_due = _evaluations_due(run)
 
     def attend(self, run: Run) -> None:
         """To be called after every step of the environments."""
@@ -36,10 +35,11 @@ class Schedule:
         if now - self._logged_at >= run.options.log_every:
             with run.clock.part("log"):
                 self._log(run, now)
-        if run.interrupted:
-            return
-        if _evaluations_due(run) > self._evaluations_due and run.step < run.options.steps:  # At the end `finish` does it.
-            self._evaluations_due = _evaluations_due(run)
+        self.evaluate(run)
+
+    def evaluate(self, run: Run) -> None:
+        """Plays an evaluation if one is due. To be called before the first step too: a resumed run may have been interrupted in one."""
+        if _evaluation_is_due(run) and not run.interrupted:
             with run.clock.part("evaluation"):
                 run_evaluation(run)
 
@@ -101,8 +101,10 @@ def _facts(run: Run, steps: float, train_steps: float) -> Iterator[str]:
     yield f"{train_steps:.1f} train steps/s"
 
 
-def _evaluations_due(run: Run) -> int:
-    return run.step // run.options.eval_every if run.options.eval_every else 0
+def _evaluation_is_due(run: Run) -> bool:
+    """Whether a multiple of --eval-every has been reached since the last evaluation; at the end `finish` evaluates."""
+    every, last = run.options.eval_every, run.evaluation["step"] if run.evaluation else 0
+    return every > 0 and run.step // every > last // every and run.step < run.options.steps
 
 
 def log_episode(run: Run, score: float, length: int) -> None:
