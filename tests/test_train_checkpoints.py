@@ -13,12 +13,11 @@ from typing import Any
 
 import pytest
 from train_fakes import EPISODE, FakeLearner
-from train_runs import Make, batches, run_quietly, stored
+from train_runs import Make, batches, logged, run_quietly, stored
 
 from reference_numpy.training_loop import derive_seed
 from train import checkpoint, files, loop, setup
 from train.errors import UserError
-from train.logger import read_metrics
 from train.resume import save
 
 # Checkpoints
@@ -111,7 +110,7 @@ def test_metrics_after_the_checkpoint_are_dropped_on_resume(make: Make) -> None:
     kept = path.read_text()
     path.write_text(kept + json.dumps({"step": 70, "seconds": 1.0, "episode/return": -1.0}) + '\n{"step": 71, "sec')
     loop.run(make(steps=90), FakeLearner)
-    lines = read_metrics(path)
+    lines = logged(path.parent)
     assert not any(line.get("episode/return") == -1.0 for line in lines)
     assert path.read_text().startswith(kept)
     assert lines[-1]["step"] == 90
@@ -364,12 +363,12 @@ def test_an_evaluation_that_was_interrupted_is_made_up_for(make: Make, monkeypat
     saved = checkpoint.open_checkpoint(options.logdir)
     assert saved.info["counters"]["records"] == 20
     assert (saved.info["counters"]["evaluations"], saved.info["evaluation"]) == (0, None)
-    assert not any("evaluation/return" in line for line in read_metrics(options.logdir / "metrics.jsonl"))
+    assert not any("evaluation/return" in line for line in logged(options.logdir))
     assert loop.run(options, FakeLearner)
     lines, expected = (
         [
             {name: value for name, value in line.items() if name != "seconds" and not name.startswith(("speed/", "time/", "memory/"))}
-            for line in read_metrics(logdir / "metrics.jsonl")
+            for line in logged(logdir)
         ]
         for logdir in (options.logdir, whole.logdir)
     )
@@ -392,4 +391,4 @@ def test_what_ends_the_last_evaluation_does_not_cost_the_training(make: Make, mo
     FakeLearner.diary.clear()
     assert loop.run(options, FakeLearner)
     assert batches() == []
-    assert any("evaluation/return" in line for line in read_metrics(options.logdir / "metrics.jsonl"))
+    assert any("evaluation/return" in line for line in logged(options.logdir))

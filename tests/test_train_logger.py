@@ -17,7 +17,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from train import logger as module
 from train.errors import UserError
-from train.logger import Display, Logger, iterate_metrics, read_metrics
+from train.logger import Display, Logger, iterate_metrics
 
 ABOUT = {
     **dict.fromkeys(("task", "backend", "device", "profile", "size", "parameters", "command", "machine"), "-"),
@@ -122,14 +122,15 @@ def test_a_full_disk_under_tensorboard_is_a_user_error(tmp_path: Path, monkeypat
 def test_damaged_lines_are_left_out(tmp_path: Path) -> None:
     path = tmp_path / "metrics.jsonl"
     path.write_bytes(
-        b'{"step": 1, "a": NaN}\n\xff\xfe\n[1]\n{"a": 1}\n{"step": "x"}\n{"step": 2, "a": "text", "b": true}\n{"step": Infinity}\n{"st'
+        b'{"step": 1, "a": NaN}\n\xff\xfe\n[1]\n{"a": 1}\n{"step": "x"}\n{"step": 2, "a": "text", "b": true}\n{"step": Infinity}\n'
+        b'{"step": -1}\n{"step": 3, "seconds": NaN}\n{"step": 3, "a": 1' + b"0" * 400 + b'}\n{"st'
     )
-    lines = read_metrics(path)
+    lines = [line for line in iterate_metrics(path) if line is not None]
     assert [line["step"] for line in lines] == [1, 2]
     assert math.isnan(lines[0]["a"])
     assert lines[1] == {"step": 2}
-    assert sum(line is None for line in iterate_metrics(path)) == 6
-    assert read_metrics(tmp_path / "missing") == []
+    assert sum(line is None for line in iterate_metrics(path)) == 9
+    assert list(iterate_metrics(tmp_path / "missing")) == []
 
 
 def events(logdir: Path) -> EventAccumulator:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from train_agents import random_learner_state, save_checkpoint
+from train_runs import logged
 
 import train.commands.eval
 from conformance.adapters import jax_adapter, torch_adapter
@@ -22,7 +23,6 @@ from train.cli import main
 from train.commands.eval import sentence, summarize
 from train.envs import Environments
 from train.evaluation import Episode
-from train.logger import read_metrics
 from train.replay import Replay
 
 pytestmark = pytest.mark.usefixtures("compile_once")
@@ -219,7 +219,7 @@ def test_a_run_that_changes_the_backend_goes_on(tmp_path: Path, capsys: pytest.C
     replay = Replay.restore(tmp_path / "replay", saved.info["replay"], saved.info["identity"]["replay_capacity"], 8, **with_latents)
     assert len(replay.state_dict()["records/reward"]) == 900
 
-    lines = [line for line in read_metrics(tmp_path / "metrics.jsonl") if "train/loss/total" in line]
+    lines = [line for line in logged(tmp_path) if "train/loss/total" in line]
     assert len(lines) == 431
     losses = {
         step: np.array([line["train/loss/total"] for line in lines if step < line["step"] <= step + 50]) for step in (250, 300, 550, 600)

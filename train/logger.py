@@ -192,7 +192,7 @@ def _png(image: np.ndarray) -> bytes:
 
 
 def iterate_metrics(path: Path) -> Iterator[dict[str, float] | None]:
-    """The lines of a metrics.jsonl one by one: the numbers of each by name, or None for a line that is damaged."""
+    """The lines of a metrics.jsonl one by one: the numbers of each by name, or None for a line that is damaged or cut off."""
     if path.exists():
         with path.open("rb") as file:
             yield from map(_numbers, file)
@@ -201,15 +201,10 @@ def iterate_metrics(path: Path) -> Iterator[dict[str, float] | None]:
 def _numbers(text: bytes) -> dict[str, float] | None:
     """The numbers of a line by name; None if it is damaged."""
     try:
-        line = {name: value for name, value in json.loads(text).items() if type(value) in (int, float)}
-        return line if math.isfinite(line["step"]) else None
+        line = {name: float(value) for name, value in json.loads(text).items() if type(value) in (int, float)}
+        return line if 0 <= line["step"] < math.inf and 0 <= line.get("seconds", 0.0) < math.inf else None
     except (ValueError, KeyError, AttributeError, RecursionError, OverflowError):
         return None
-
-
-def read_metrics(path: Path) -> list[dict[str, float]]:
-    """The lines of a metrics.jsonl; damaged ones are left out, as is a last one that was cut off in writing."""
-    return [line for line in iterate_metrics(path) if line is not None]
 
 
 class Display:

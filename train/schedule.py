@@ -12,10 +12,11 @@ from reference_numpy.training_loop import derive_seed
 from train import resume
 from train.curve import draw_curve
 from train.envs import Environments, Record
+from train.errors import writing
 from train.evaluation import Agent, Interrupted, evaluate
 from train.finite import finite_action, mean_metrics
 from train.logger import duration
-from train.pictures import draw_predictions
+from train.pictures import draw_predictions, prune_pictures
 from train.prediction import SequenceRecorder, predict, prediction_errors
 from train.state import Run
 
@@ -158,7 +159,11 @@ def show_predictions(run: Run, recorder: SequenceRecorder) -> dict[str, float]:
         return {}
     spaces, seed = run.envs.spaces, derive_seed(run.options.seed, "prediction", run.counters.evaluations)
     predicted = predict(run.learner, spaces, truth, seed)
-    for name, path in draw_predictions(run.options.logdir / "predictions", run.step, spaces, truth, predicted).items():
+    directory = run.options.logdir / "predictions"
+    with writing(directory):
+        pictures = draw_predictions(directory, run.step, spaces, truth, predicted)
+        prune_pictures(directory, run.step)
+    for name, path in pictures.items():
         run.logger.picture(f"prediction/{name}", path, run.step)
     return prediction_errors(spaces, truth, predicted)
 
