@@ -261,7 +261,7 @@ def test_a_run_whose_checkpoints_are_all_damaged_does_not_begin_anew(make: Make)
 
 
 def junk(rng: random.Random, depth: int = 0) -> Any:
-    kinds = [None, True, -1, 2**62, 10**400, 1e300, float("nan"), "", "x" * 3, "1/0", [], {}]
+    kinds = [None, True, -1, 0.5, 2**62, 10**400, 1e300, float("nan"), "", "x" * 3, "1/0", [], {}]
     return (
         rng.choice(kinds)
         if depth > 1 or rng.random() < 0.7

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import train_fakes
 from train_agents import random_learner_state, save_checkpoint
 from train_runs import logged
 
@@ -134,6 +135,24 @@ def test_an_action_that_is_not_finite_ends_the_evaluation(
 ) -> None:
     monkeypatch.setattr(train.commands.eval.Agent, "__call__", lambda self, record: np.full((1, 2), np.nan))
     assert "the action is not finite" in refusal(capsys, counting, *COUNT, "1")
+
+
+def test_an_evaluation_shows_its_progress_and_what_failed(
+    counting: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("train.logger.PLAIN_EVERY", 0.0)
+    step, calls = train_fakes.Counting.step, []
+
+    def fails_once(self: train_fakes.Counting, action: np.ndarray) -> Any:
+        calls.append(action)
+        return 1 / 0 if len(calls) == 3 else step(self, action)
+
+    monkeypatch.setattr(train_fakes.Counting, "step", fails_once)
+    assert main(["eval", counting, *COUNT, "1"]) == 0
+    out = capsys.readouterr().out
+    assert "  0%  evaluation 0/1 episodes" in out
+    assert "environment 0 was made anew, its episode is abandoned (error): " in out
+    assert "length 5 (min 5, max 5)" in out
 
 
 # One checkpoint for both backends

@@ -13,9 +13,10 @@ from reference_numpy.training_loop import can_train, derive_seed
 from train import resume
 from train.backend import Learner
 from train.envs import Record
+from train.evaluation import report_failures
 from train.finite import finite_action, settle
 from train.options import Options
-from train.schedule import Schedule, finish, log_episode, log_failures
+from train.schedule import Schedule, finish, log_episode
 from train.setup import prepare
 from train.state import Run, TrainStep
 
@@ -46,7 +47,7 @@ def train(run: Run) -> bool:
             schedule.attend(run)
             with run.clock.part("environments"):
                 run.record = run.envs.finish()
-            log_failures(run, run.envs)
+            report_failures(run.envs, run.display.say)
             schedule.save(run)
         if run.interrupted:
             path = resume.save(run)

@@ -11,9 +11,9 @@ import numpy as np
 from reference_numpy.training_loop import derive_seed
 from train import resume
 from train.curve import draw_curve
-from train.envs import Environments, Record
+from train.envs import Record
 from train.errors import writing
-from train.evaluation import Agent, Interrupted, evaluate
+from train.evaluation import Agent, Interrupted, evaluate, report_failures
 from train.finite import finite_action, mean_metrics
 from train.logger import duration
 from train.pictures import draw_predictions, prune_pictures
@@ -115,12 +115,6 @@ def log_episode(run: Run, score: float, length: int) -> None:
     run.logger.write(run.step, run.counters.seconds, {"episode/return": score, "episode/length": length})
 
 
-def log_failures(run: Run, envs: Environments) -> None:
-    """Environments that had to be made anew."""
-    for failure in envs.take_failures():
-        run.display.say(f"environment {failure.worker} was made anew, its episode is abandoned ({failure.kind}): {failure.message}")
-
-
 def run_evaluation(run: Run) -> None:
     """Plays evaluation episodes with the agent as it is. An interrupted evaluation leaves nothing behind."""
     options, counters = run.options, run.counters
@@ -142,7 +136,7 @@ def run_evaluation(run: Run) -> None:
     except Interrupted:
         return
     finally:
-        log_failures(run, run.test_envs)
+        report_failures(run.test_envs, run.display.say)
     errors = show_predictions(run, recorder)
     counters.evaluations += 1
     counters.evaluation_steps = agent.step

@@ -17,7 +17,8 @@ from train.checkpoint import open_checkpoint
 from train.cli import Parser
 from train.envs import Environments, Record, is_slow, make_env
 from train.errors import UserError, writing
-from train.evaluation import Agent, Episode, play_episodes
+from train.evaluation import Agent, Episode, play_episodes, report_failures
+from train.logger import Display
 from train.options import Options
 from train.saved_agent import SavedAgent, agent_of
 from train.setup import import_learner, make_learner
@@ -60,7 +61,8 @@ def main(arguments: Sequence[str]) -> int:
             learner.load_state_dict(checkpoint.learner)
         except ValueError as error:
             raise UserError(f"the checkpoint {checkpoint.path} does not fit this version: {error}") from error
-        episodes = play(learner, envs, values.episodes, options.seed)
+        with Display(values.episodes) as display:
+            episodes = play(learner, envs, values.episodes, options.seed, display)
     summary = summarize(episodes)
     where = f"{options.backend} on {learner.device}"
     print(f"{checkpoint.path}: {options.task}, step {saved.info['step']:,}; {len(episodes)} episodes with {where}, seed {values.seed}")
@@ -74,21 +76,28 @@ def main(arguments: Sequence[str]) -> int:
     return 0
 
 
-def play(learner: Learner, envs: Environments, episodes: int, seed: int) -> list[Episode]:
+def play(learner: Learner, envs: Environments, episodes: int, seed: int, display: Display) -> list[Episode]:
     """Whole episodes of the learner, with the seeds of a run's first evaluation. seed: takes the place of the run's. [LOOP-19], [LOOP-26]
 
     Raises:
       UserError: an action that is not finite, or an episode that does not end.
     """
-    agent = Agent(learner, envs, seed, 0)
+    agent, ended = Agent(learner, envs, seed, 0), 0
 
     def act(record: Record) -> np.ndarray:
+        nonlocal ended
+        ended += int(record["is_last"].sum())
+        display.phase("evaluation", min(ended, episodes), episodes, "episodes")
         action = np.asarray(agent(record), np.float32)
         if not np.isfinite(action).all():  # [LOOP-12]
             raise UserError(f"at policy step {agent.step} the action is not finite: the parameters of the checkpoint are broken")
         return action
 
-    return play_episodes(envs, act, episodes, [derive_seed(seed, "evaluation_environment", worker) for worker in range(envs.count)])
+    seeds = [derive_seed(seed, "evaluation_environment", worker) for worker in range(envs.count)]
+    try:
+        return play_episodes(envs, act, episodes, seeds)
+    finally:
+        report_failures(envs, display.say)
 
 
 def summarize(episodes: Sequence[Episode]) -> dict[str, float | None]:
