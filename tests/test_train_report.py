@@ -320,7 +320,12 @@ def full_run(path: Path, seed: int) -> Path:
     about = {
         "options": {"seed": seed, "steps": 100},
         "command": "train --backend jax --task gym:X",
-        "preflight": {"passed": True, "worst": 1.5e-7, "summary": "networks agree"},
+        "preflight": {
+            "passed": True,
+            "worst": 1.5e-7,
+            "summary": "networks agree",
+            "comparisons": [{"name": "encoder", "requirements": ["NET-2", "NET-12"], "share": 0.0625}, 3],
+        },
         "machine": {"processor": "A Processor", "cores": 2, "versions": {"jax": "1"}},
         "starts": [start, {**start, "step": 50, "versions": {"jax": "2"}}],
         "spaces": {"observations": {"image": {"kind": "image", "height": 8}}, "actions": {}},
@@ -337,6 +342,7 @@ def test_the_page_holds_what_the_runs_are(tmp_path: Path) -> None:
     document = Document(page(*paths))
     for text in ("gym:X", "2 seeds", "200 ± 0", "train --backend jax --task gym:X", "networks agree", "1.5e-07", "A Processor", "jax 2"):
         assert text in document.text, text
+    assert "encoderNET-2, NET-12passed6.25%" in document.text
     assert "not finite at step 10" in document.text
     assert "train: 75.0% on average" in document.text
     assert "image.gif is damaged" in document.text
