@@ -82,7 +82,7 @@ def preflight_adapter(adapter: object, spaces: Spaces, config: Config, seed: int
                 worst, run.worst = max(worst, run.worst.deviation), Worst()
         except Deviation as deviation:
             return Report(False, run.worst.deviation, f"{name}: {deviation}", comparisons)
-    names = " and ".join(name for name, _ in parts)
+    names = ", ".join(name for name, _ in parts)
     summary = f"{names} agree with the reference in {config.compute_dtype}, {run.compared:,} numbers compared"
     return Report(True, worst, summary, comparisons)
 

@@ -178,6 +178,15 @@ def test_metrics_curve_and_last_words(make: Make, capsys: pytest.CaptureFixture[
     assert capsys.readouterr().out.splitlines()[-1] == "return 50, random 10, ratio 5.00"
 
 
+@pytest.mark.parametrize(("episodes", "error"), [(3, 40 / 3), (1, None)])
+def test_the_standard_error_of_an_evaluation(make: Make, episodes: int, error: float | None) -> None:
+    """Returns 10, 50 and 10: their sample's standard deviation is 40 / √3. One return has none."""
+    options = make(eval_episodes=episodes)
+    assert loop.run(options, FakeLearner)
+    (line,) = [line for line in logged(options.logdir) if "evaluation/return" in line]
+    assert line.get("evaluation/return_standard_error") == (error and pytest.approx(error))
+
+
 def test_a_loss_that_is_not_finite_stops_the_run_and_spares_the_checkpoint(make: Make) -> None:
     options = make(steps=30)
     loop.run(options, FakeLearner)

@@ -21,7 +21,8 @@ def draw_curve(logdir: Path, title: str, random_return: float | None) -> Path:
       UserError: the disk refuses it.
     """
     columns = _columns(logdir / "metrics.jsonl")
-    (steps, returns), (eval_steps, eval_means), (_, eval_errors) = (columns[name] for name in (EPISODE, EVALUATION, ERROR))
+    (steps, returns), (eval_steps, eval_means), (error_steps, errors) = (columns[name] for name in (EPISODE, EVALUATION, ERROR))
+    known = dict(zip(error_steps, errors, strict=True))
 
     figure = Figure(figsize=(8, 4.5), dpi=150, layout="constrained")
     axes = figure.subplots()
@@ -32,7 +33,7 @@ def draw_curve(logdir: Path, title: str, random_return: float | None) -> Path:
         axes.errorbar(
             eval_steps,
             eval_means,
-            yerr=eval_errors,
+            yerr=[known.get(step, 0.0) for step in eval_steps],
             color=ORANGE,
             marker="o",
             markersize=5,

@@ -92,14 +92,13 @@ def learn(run: Run) -> None:
     number = run.counters.train_steps
     seed = derive_seed(run.options.seed, "train", number)
     if not run.warm:
-        run.display.phase("the first train step, which JAX compiles")
+        run.display.phase("the first train step" + (", which JAX compiles" if run.options.backend == "jax" else ""))
         run.warm = True
     with run.clock.part("train"):
         called = time.perf_counter()
         metrics, latents = run.learner.train_step(batch, seed)
-        run.replay.write_back(
-            ids, latents, lambda: run.clock.computed(called), metrics["skipped"]
-        )  # Waits until the step before is computed.
+        # Waits until the step before is computed.
+        run.replay.write_back(ids, latents, lambda: run.clock.computed(called), metrics["skipped"])
         settle(run)
     run.counters.train_steps += 1
     run.unsettled = TrainStep(number, seed, batch, metrics)

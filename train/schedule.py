@@ -140,9 +140,10 @@ def run_evaluation(run: Run) -> None:
     errors = show_predictions(run, recorder)
     counters.evaluations += 1
     counters.evaluation_steps = agent.step
-    error = float(np.std(returns) / math.sqrt(len(returns)))
     run.evaluation = {"step": run.step, "return": float(np.mean(returns))}
-    metrics = {"return": run.evaluation["return"], "return_standard_error": error, "return_min": min(returns), "return_max": max(returns)}
+    metrics = {"return": run.evaluation["return"], "return_min": min(returns), "return_max": max(returns)}
+    if len(returns) > 1:
+        metrics["return_standard_error"] = float(np.std(returns, ddof=1)) / math.sqrt(len(returns))
     run.logger.write(run.step, counters.seconds, {f"evaluation/{name}": value for name, value in metrics.items()} | errors)
 
 
