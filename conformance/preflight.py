@@ -6,14 +6,14 @@ into another class, after which nothing is comparable.
 """
 
 import dataclasses
-import functools
-from collections.abc import Iterator
+import re
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 
 from conformance.adapter import load_adapter
-from conformance.check import Deviation, Run
+from conformance.check import Deviation, Run, Worst
 from conformance.problems import (
     Problem,
     random_batch,
@@ -37,14 +37,29 @@ NETWORK_BOUND = {"float64": 1e-9, "float32": 2e-5, "bfloat16": 0.1}
 LOSS_BOUND = {"float64": 1e-8, "float32": 1e-5}
 GRADIENT_BOUND = {"float64": 1e-5, "float32": 2e-4}
 
+Compared = Iterator[tuple[str, Callable[..., object]]]  # what has just been compared, and the function of the reference that says it
+
+
+@dataclasses.dataclass(frozen=True)
+class Comparison:
+    """What agreed. requirements: those that its function in the reference names. share: worst deviation as a share of the allowed one."""
+
+    name: str
+    requirements: list[str]
+    share: float
+
 
 @dataclasses.dataclass(frozen=True)
 class Report:
-    """passed: whether training may start. worst: largest deviation, relative to the size of what deviates. summary: one line."""
+    """passed: whether training may start. worst: largest deviation, relative to the size of what deviates. summary: one line.
+
+    comparisons: what agreed, up to the first deviation.
+    """
 
     passed: bool
     worst: float
     summary: str
+    comparisons: list[Comparison]
 
 
 def preflight(backend: str, spaces: Spaces, config: Config, device: str | None = None, seed: int = 0) -> Report:
@@ -56,21 +71,23 @@ def preflight_adapter(adapter: object, spaces: Spaces, config: Config, seed: int
     """Compares any adapter with the reference."""
     small = dataclasses.replace(config, batch_size=ROWS, batch_length=STEPS, imagination_horizon=STEPS)
     run = Run(adapter, config.compute_dtype, "", seed)
-    worst = 0.0
+    worst, comparisons = 0.0, []
     parts = [("networks", compare_networks)]
     if config.compute_dtype in LOSS_BOUND:
         parts += [("losses and gradient", compare_losses)]
     for name, part in parts:
         try:
-            part(run, spaces, small)
+            for what, function in part(run, spaces, small):
+                comparisons.append(Comparison(what, re.findall(r"\[([A-Z]+-\d+)\]", function.__doc__ or ""), run.worst.share))
+                worst, run.worst = max(worst, run.worst.deviation), Worst()
         except Deviation as deviation:
-            return Report(False, run.worst.deviation, f"{name}: {deviation}")
-        worst = max(worst, run.worst.deviation)
-    what = " and ".join(name for name, _ in parts)
-    return Report(True, worst, f"{what} agree with the reference in {config.compute_dtype}, {run.compared:,} numbers compared")
+            return Report(False, run.worst.deviation, f"{name}: {deviation}", comparisons)
+    names = ", ".join(name for name, _ in parts)
+    summary = f"{names} agree with the reference in {config.compute_dtype}, {run.compared:,} numbers compared"
+    return Report(True, worst, summary, comparisons)
 
 
-def compare_networks(run: Run, spaces: Spaces, config: Config) -> None:
+def compare_networks(run: Run, spaces: Spaces, config: Config) -> Compared:
     """Encoder, one step of the recurrent model, prior, decoder and heads, each on given inputs."""
     rng = np.random.default_rng(run.seed)
     params = random_parameters(rng, config, spaces, "float32")
@@ -80,25 +97,31 @@ def compare_networks(run: Run, spaces: Spaces, config: Config) -> None:
     tokens = networks.encoder(params, observations, spaces, config)
     deter = rssm.core(params, carry["deter"], carry["stoch"], action, config)
     feature = networks.feature(carry["deter"], carry["stoch"])
-    close = functools.partial(run.expect, magnitude="tensor", bound=NETWORK_BOUND[run.dtype])
-    close("encoder", (params, observations, spaces, config), tokens)
-    close("core", (params, carry["deter"], carry["stoch"], action, config), deter)
-    close("posterior", (params, deter, tokens, config), rssm.posterior(params, deter, tokens, config))
-    close("prior", (params, deter, config), rssm.prior(params, deter, config))
-    close("decoder", (params, feature, spaces, config), networks.decoder(params, feature, spaces, config))
-    close("actor", (params, feature, spaces, config), networks.actor(params, feature, spaces, config))
-    for head in ("reward_head", "continue_head", "critic"):
-        close(head, (params, feature, config), getattr(networks, head)(params, feature, config))
+    calls: list[tuple[Callable[..., object], tuple[Any, ...], object]] = [
+        (networks.encoder, (params, observations, spaces, config), tokens),
+        (rssm.core, (params, carry["deter"], carry["stoch"], action, config), deter),
+        (rssm.posterior, (params, deter, tokens, config), rssm.posterior(params, deter, tokens, config)),
+        (rssm.prior, (params, deter, config), rssm.prior(params, deter, config)),
+        (networks.decoder, (params, feature, spaces, config), networks.decoder(params, feature, spaces, config)),
+        (networks.actor, (params, feature, spaces, config), networks.actor(params, feature, spaces, config)),
+    ]
+    for head in (networks.reward_head, networks.continue_head, networks.critic):
+        calls.append((head, (params, feature, config), head(params, feature, config)))
+    for function, arguments, expected in calls:
+        run.expect(function.__name__, arguments, expected, magnitude="tensor", bound=NETWORK_BOUND[run.dtype])
+        yield function.__name__, function
 
 
-def compare_losses(run: Run, spaces: Spaces, config: Config) -> None:
+def compare_losses(run: Run, spaces: Spaces, config: Config) -> Compared:
     """Every loss of a training step, and the derivative of the total along random directions, where the candidate has gradients."""
     problem = comparable_problem(run, spaces, config)
     total, aux = agent.losses(*problem.loss_arguments)
     actual_total, actual = run.call("losses", *problem.loss_arguments)
     size = max(1.0, *(abs(loss) for loss in aux["losses"].values()))
     run.compare("losses", actual["losses"], aux["losses"], magnitude=size, bound=LOSS_BOUND[run.dtype])
+    yield "losses", agent.losses
     run.compare("total", actual_total, total, magnitude=max(size, abs(total)), bound=LOSS_BOUND[run.dtype])
+    yield "total loss", agent.losses
 
     if not callable(getattr(run.adapter, "gradients", None)):
         return  # the reference itself
@@ -115,7 +138,9 @@ def compare_losses(run: Run, spaces: Spaces, config: Config) -> None:
         product = sum(float((np.asarray(gradients[name]) * along).sum()) for name, along in direction.items())
         # The size of such a product on average: by chance a product can be nearly 0, and its error is not.
         usual = np.sqrt(sum(float((np.asarray(gradients[name]) ** 2).mean()) for name in direction))
-        run.compare(f"gradient along {label}", product, derivative, magnitude=max(usual, abs(derivative)), bound=GRADIENT_BOUND[run.dtype])
+        name = f"gradient along {label}"
+        run.compare(name, product, derivative, magnitude=max(usual, abs(derivative)), bound=GRADIENT_BOUND[run.dtype])
+        yield name, agent.directional_derivative
 
 
 def directions(params: dict[str, np.ndarray], seed: int) -> Iterator[tuple[str, dict[str, np.ndarray]]]:

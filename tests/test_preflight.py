@@ -39,6 +39,12 @@ class ChangedGradients:
 def test_a_right_backend_passes(dtype: str) -> None:
     report = preflight("torch", SPACES, config(dtype), "cpu")
     assert report.passed, report.summary
+    named = {one.name: one for one in report.comparisons}
+    assert {"encoder", "core", "critic"} <= named.keys()
+    assert ("losses" in named) is ("gradient along all parameters" in named) is (dtype != "bfloat16")
+    assert all(one.requirements and 0 <= one.share <= 1 for one in report.comparisons)
+    assert {"NET-2", "NET-12"} <= set(named["encoder"].requirements)
+    assert len({one.share for one in report.comparisons}) > 5, "each has a share of its own"
     assert preflight("numpy", SPACES, config(dtype)).passed
 
 
@@ -54,6 +60,7 @@ def test_a_gradient_that_is_missing_is_seen(start: str, dtype: str) -> None:
     report = preflight_adapter(ChangedGradients(dtype, without), SPACES, config(dtype))
     assert not report.passed
     assert "gradient along" in report.summary
+    assert report.comparisons[-1].name.startswith(("total loss", "gradient along"))
 
 
 def test_a_gradient_that_is_not_finite_is_seen() -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from conformance.preflight import Report
+from conformance.preflight import Comparison, Report
 from spec import Discrete, Spaces, Vector, hyperparameters, load_config
 from train import about as module
 from train.about import command_line, nearest, read_about, write_about
@@ -20,7 +20,7 @@ SPACES = Spaces({"observation": Vector(4)}, {"action": Discrete((2,))})
 
 
 def write(options: Options, resumed_at: int | None = None) -> dict[str, Any]:
-    report = Report(True, 1e-7, "all agree")
+    report = Report(True, 1e-7, "all agree", [Comparison("encoder", ["NET-2"], 0.25)])
     return write_about(options, spaces=SPACES, device="cpu", parameters=123, preflight=report, resumed_at=resumed_at)
 
 
@@ -62,7 +62,8 @@ def test_run_json_says_everything(tmp_path: Path) -> None:
     assert about["options"]["seed"] == 5
     assert about["hyperparameters"]["batch_length"] == 32
     assert about["changed_hyperparameters"]["batch_length"] == 32
-    assert about["preflight"] == {"passed": True, "worst": 1e-7, "summary": "all agree"}
+    comparison = {"name": "encoder", "requirements": ["NET-2"], "share": 0.25}
+    assert about["preflight"] == {"passed": True, "worst": 1e-7, "summary": "all agree", "comparisons": [comparison]}
     assert about["spaces"]["actions"] == {"action": {"kind": "discrete", "classes": [2]}}
     assert {"processor", "cores", "memory_gib", "system", "accelerator", "python", "versions", "commit"} <= about["machine"].keys()
     assert about["machine"]["versions"]["numpy"]
@@ -82,10 +83,10 @@ def test_a_resumed_run_appends_its_start(tmp_path: Path) -> None:
     assert len(new["starts"]) == 1
 
 
-@pytest.mark.parametrize("content", ["", "[]", '{"format": 99}'])
+@pytest.mark.parametrize("content", ["", "[]", '{"format": 99}', "[" * 100_000, '{"format": 1}', '{"format": 1, "id": 2, "starts": 3}'])
 def test_a_damaged_run_json_does_not_stop_a_resume(tmp_path: Path, content: str) -> None:
     (tmp_path / "run.json").write_text(content)
-    assert read_about(tmp_path) is None
+    assert (read_about(tmp_path) is None) is ('"format": 1' not in content)
     assert len(write(make_options("jax", {"logdir": tmp_path}, {}), 10)["starts"]) == 1
 
 

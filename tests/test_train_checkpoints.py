@@ -13,12 +13,11 @@ from typing import Any
 
 import pytest
 from train_fakes import EPISODE, FakeLearner
-from train_runs import Make, batches, run_quietly, stored
+from train_runs import Make, batches, logged, run_quietly, stored
 
 from reference_numpy.training_loop import derive_seed
 from train import checkpoint, files, loop, setup
 from train.errors import UserError
-from train.logger import read_metrics
 from train.resume import save
 
 # Checkpoints
@@ -111,7 +110,7 @@ def test_metrics_after_the_checkpoint_are_dropped_on_resume(make: Make) -> None:
     kept = path.read_text()
     path.write_text(kept + json.dumps({"step": 70, "seconds": 1.0, "episode/return": -1.0}) + '\n{"step": 71, "sec')
     loop.run(make(steps=90), FakeLearner)
-    lines = read_metrics(path)
+    lines = logged(path.parent)
     assert not any(line.get("episode/return") == -1.0 for line in lines)
     assert path.read_text().startswith(kept)
     assert lines[-1]["step"] == 90
@@ -167,6 +166,17 @@ def test_resume_never_and_must(make: Make, resume: str) -> None:
         loop.run(make(resume=resume), FakeLearner)
 
 
+def test_two_runs_do_not_share_a_log_directory(make: Make) -> None:
+    with ExitStack() as stack:
+        state = setup.prepare(make(), FakeLearner, stack)
+        state.logger.write(1, 0.0, {"a": 1.0})
+        written = (make().logdir / "metrics.jsonl").read_bytes()
+        with pytest.raises(UserError, match="another process is training in"):
+            loop.run(make(), FakeLearner)
+        assert (make().logdir / "metrics.jsonl").read_bytes() == written
+    assert loop.run(make(), FakeLearner)
+
+
 @pytest.mark.covers("LOOP-22")
 def test_a_checkpoint_is_complete_or_absent(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     loop.run(make(), FakeLearner)
@@ -208,6 +218,16 @@ def test_a_step_that_is_saved_again_is_never_without_a_checkpoint(make: Make, mo
     assert found.info["replay"]
 
 
+def test_what_a_killed_save_left_does_not_stop_the_next_one(make: Make) -> None:
+    with ExitStack() as stack:
+        state = setup.prepare(make(), FakeLearner, stack)
+        loop.train(state)
+        path = save(state)
+        shutil.copytree(path, path.with_suffix(".old"))
+        save(state)
+    assert [entry.name for entry in path.parent.iterdir()] == [path.name]
+
+
 @pytest.mark.parametrize("name", ["learner.safetensors", "loop.safetensors", "run.json", "SHA256SUMS", "replay"])
 @pytest.mark.parametrize("damage", ["cut off", "a flipped bit", "missing"])
 def test_a_damaged_checkpoint_falls_back_to_the_one_before(make: Make, name: str, damage: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -241,7 +261,7 @@ def test_a_run_whose_checkpoints_are_all_damaged_does_not_begin_anew(make: Make)
 
 
 def junk(rng: random.Random, depth: int = 0) -> Any:
-    kinds = [None, True, -1, 2**62, 10**400, 1e300, float("nan"), "", "x" * 3, "1/0", [], {}]
+    kinds = [None, True, -1, 0.5, 2**62, 10**400, 1e300, float("nan"), "", "x" * 3, "1/0", [], {}]
     return (
         rng.choice(kinds)
         if depth > 1 or rng.random() < 0.7
@@ -322,23 +342,38 @@ def test_the_first_interrupt_saves(make: Make, monkeypatch: pytest.MonkeyPatch) 
     assert signal.getsignal(signal.SIGINT) is handler
 
 
-def test_an_interrupt_abandons_an_evaluation(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Evaluation is due at step 20, after 10 policy steps; the signal comes in its second step."""
+@pytest.mark.covers("LOOP-23")
+@pytest.mark.parametrize("policy_step", [9, 11], ids=["in the step before", "in its second step"])
+def test_an_evaluation_that_was_interrupted_is_made_up_for(make: Make, monkeypatch: pytest.MonkeyPatch, policy_step: int) -> None:
+    """Evaluation is due at step 20, after 10 policy steps. Metrics are then those of a run in one go."""
+    options = make(task="gym:CartPole-v1", eval_every=20, eval_episodes=4)
+    whole = dataclasses.replace(options, logdir=options.logdir / "whole")
+    loop.run(whole, FakeLearner)
+    FakeLearner.diary.clear()
     policy = FakeLearner.policy
 
     def interrupt(self: FakeLearner, *arguments: Any) -> Any:
-        if sum(kind == "policy" for kind, _ in FakeLearner.diary) == 11:
+        if sum(kind == "policy" for kind, _ in FakeLearner.diary) == policy_step:
             os.kill(os.getpid(), signal.SIGINT)
         return policy(self, *arguments)
 
-    monkeypatch.setattr(FakeLearner, "policy", interrupt)
-    options = make(eval_every=20, eval_episodes=40)
-    assert not loop.run(options, FakeLearner)
+    with monkeypatch.context() as patch:
+        patch.setattr(FakeLearner, "policy", interrupt)
+        assert not loop.run(options, FakeLearner)
     saved = checkpoint.open_checkpoint(options.logdir)
-    assert saved
     assert saved.info["counters"]["records"] == 20
     assert (saved.info["counters"]["evaluations"], saved.info["evaluation"]) == (0, None)
-    assert not any("evaluation/return" in line for line in read_metrics(options.logdir / "metrics.jsonl"))
+    assert not any("evaluation/return" in line for line in logged(options.logdir))
+    assert loop.run(options, FakeLearner)
+    lines, expected = (
+        [
+            {name: value for name, value in line.items() if name != "seconds" and not name.startswith(("speed/", "time/", "memory/"))}
+            for line in logged(logdir)
+        ]
+        for logdir in (options.logdir, whole.logdir)
+    )
+    assert [line["step"] for line in expected if "evaluation/return" in line] == [20, 40, 60]
+    assert lines == expected
 
 
 def test_what_ends_the_last_evaluation_does_not_cost_the_training(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -356,4 +391,4 @@ def test_what_ends_the_last_evaluation_does_not_cost_the_training(make: Make, mo
     FakeLearner.diary.clear()
     assert loop.run(options, FakeLearner)
     assert batches() == []
-    assert any("evaluation/return" in line for line in read_metrics(options.logdir / "metrics.jsonl"))
+    assert any("evaluation/return" in line for line in logged(options.logdir))

@@ -187,6 +187,14 @@ def test_a_rerun_that_gives_something_else(tmp_path: Path, capsys: pytest.Captur
     )
 
 
+def test_a_log_directory_stands_for_its_last_incident(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "run.json").write_text("{}")
+    assert f"{tmp_path} holds no incident" in refused(capsys, tmp_path)
+    path = incident(tmp_path, metrics={"loss/total": NAN})
+    checkpoint.save(tmp_path, 4000, {}, {}, {}, keep=1)
+    assert printed(capsys, tmp_path).startswith(f"{path} gym:CartPole-v1, train step 41 ")
+
+
 def test_checkpoints(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     state = {
         **STATE,

@@ -1,5 +1,6 @@
 """What a run writes: metrics.jsonl cut back to a checkpoint, TensorBoard, Weights & Biases; and what it shows."""
 
+import errno
 import io
 import json
 import math
@@ -16,7 +17,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from train import logger as module
 from train.errors import UserError
-from train.logger import Display, Logger, iterate_metrics, read_metrics
+from train.logger import Display, Logger, iterate_metrics
 
 ABOUT = {
     **dict.fromkeys(("task", "backend", "device", "profile", "size", "parameters", "command", "machine"), "-"),
@@ -103,19 +104,33 @@ def test_a_full_disk_is_a_user_error(tmp_path: Path) -> None:
     logger._file = Path("/dev/full").open("ab")  # noqa: SIM115
     with pytest.raises(UserError, match=r"cannot write .*metrics.jsonl: No space left"):
         logger.write(1, 0.0, {"a": 1.0})
+    with pytest.raises(UserError, match=r"cannot write .*: No space left"):
+        logger.close()
+
+
+def test_a_full_disk_under_tensorboard_is_a_user_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    logger = Logger(tmp_path)
+    monkeypatch.setattr(logger._tensorboard._writer, "add_event", refuse)
+    with pytest.raises(UserError, match=rf"cannot write {tmp_path}: No space left"):
+        logger.write(1, 0.0, {"a": 1.0})
+    logger.close()
 
 
 def test_damaged_lines_are_left_out(tmp_path: Path) -> None:
     path = tmp_path / "metrics.jsonl"
     path.write_bytes(
-        b'{"step": 1, "a": NaN}\n\xff\xfe\n[1]\n{"a": 1}\n{"step": "x"}\n{"step": 2, "a": "text", "b": true}\n{"step": Infinity}\n{"st'
+        b'{"step": 1, "a": NaN}\n\xff\xfe\n[1]\n{"a": 1}\n{"step": "x"}\n{"step": 2, "a": "text", "b": true}\n{"step": Infinity}\n'
+        b'{"step": -1}\n{"step": 3, "seconds": NaN}\n{"step": 3, "a": 1' + b"0" * 400 + b'}\n{"st'
     )
-    lines = read_metrics(path)
+    lines = [line for line in iterate_metrics(path) if line is not None]
     assert [line["step"] for line in lines] == [1, 2]
     assert math.isnan(lines[0]["a"])
     assert lines[1] == {"step": 2}
-    assert sum(line is None for line in iterate_metrics(path)) == 6
-    assert read_metrics(tmp_path / "missing") == []
+    assert sum(line is None for line in iterate_metrics(path)) == 9
+    assert list(iterate_metrics(tmp_path / "missing")) == []
 
 
 def events(logdir: Path) -> EventAccumulator:

@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 import train_fakes
 from train_fakes import EPISODE, FakeLearner
-from train_runs import BATCH_STEPS, SMALL, Make, batches, run_quietly, stored
+from train_runs import BATCH_STEPS, SMALL, Make, batches, logged, run_quietly, stored
 
 from reference_numpy.training_loop import derive_seed
 from train import checkpoint, evaluation, loop, setup
 from train.envs import ContractEnv, Environments, make_env
 from train.errors import UserError
-from train.logger import read_metrics
 from train.nonfinite import load_incident, newest_incident
 
 # What is stored
@@ -126,7 +125,7 @@ def test_latents_are_written_back_before_the_next_draw_but_one(make: Make) -> No
 def test_evaluation_plays_whole_episodes_and_changes_nothing(make: Make) -> None:
     def play(**given: Any) -> tuple[Any, list[dict[str, float]]]:
         state = run_quietly(make(**given))
-        return state, read_metrics(given["logdir"] / "metrics.jsonl")
+        return state, logged(given["logdir"])
 
     root = make().logdir
     state, lines = play(logdir=root / "a", eval_every=20, eval_episodes=3)
@@ -168,7 +167,7 @@ def test_episodes_that_do_not_end_are_an_error(monkeypatch: pytest.MonkeyPatch) 
 def test_metrics_curve_and_last_words(make: Make, capsys: pytest.CaptureFixture[str]) -> None:
     options = make(eval_episodes=2, random_episodes=2)
     assert loop.run(options, FakeLearner)
-    lines = read_metrics(options.logdir / "metrics.jsonl")
+    lines = logged(options.logdir)
     episodes = [line for line in lines if "episode/return" in line]
     assert [line["episode/return"] for line in episodes] == [10, 10, 50, 50, 90, 90, 130, 130, 170, 170, 210, 210]
     assert {line["episode/length"] for line in episodes} == {5}
@@ -177,6 +176,15 @@ def test_metrics_curve_and_last_words(make: Make, capsys: pytest.CaptureFixture[
     assert (options.logdir / "curve.png").read_bytes().startswith(b"\x89PNG")
     assert list(options.logdir.glob("events.out.tfevents.*"))
     assert capsys.readouterr().out.splitlines()[-1] == "return 50, random 10, ratio 5.00"
+
+
+@pytest.mark.parametrize(("episodes", "error"), [(3, 40 / 3), (1, None)])
+def test_the_standard_error_of_an_evaluation(make: Make, episodes: int, error: float | None) -> None:
+    """Returns 10, 50 and 10: their sample's standard deviation is 40 / √3. One return has none."""
+    options = make(eval_episodes=episodes)
+    assert loop.run(options, FakeLearner)
+    (line,) = [line for line in logged(options.logdir) if "evaluation/return" in line]
+    assert line.get("evaluation/return_standard_error") == (error and pytest.approx(error))
 
 
 def test_a_loss_that_is_not_finite_stops_the_run_and_spares_the_checkpoint(make: Make) -> None:
@@ -204,7 +212,7 @@ def test_by_option_a_step_that_is_not_finite_is_skipped(make: Make, monkeypatch:
     monkeypatch.setattr(FakeLearner, "train_step", sometimes)
     options = make(nonfinite="skip", log_every=1e9)
     assert loop.run(options, FakeLearner)
-    (line,) = [line for line in read_metrics(options.logdir / "metrics.jsonl") if "train/skipped" in line]
+    (line,) = [line for line in logged(options.logdir) if "train/skipped" in line]
     steps = len(batches())
     assert line["train/skipped"] == pytest.approx((steps // 3) / steps)
     assert line["train/loss/total"] == 2.0

@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+import train_fakes
 from train_agents import random_learner_state, save_checkpoint
+from train_runs import logged
 
 import train.commands.eval
 from conformance.adapters import jax_adapter, torch_adapter
@@ -22,7 +24,6 @@ from train.cli import main
 from train.commands.eval import sentence, summarize
 from train.envs import Environments
 from train.evaluation import Episode
-from train.logger import read_metrics
 from train.replay import Replay
 
 pytestmark = pytest.mark.usefixtures("compile_once")
@@ -136,6 +137,24 @@ def test_an_action_that_is_not_finite_ends_the_evaluation(
     assert "the action is not finite" in refusal(capsys, counting, *COUNT, "1")
 
 
+def test_an_evaluation_shows_its_progress_and_what_failed(
+    counting: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("train.logger.PLAIN_EVERY", 0.0)
+    step, calls = train_fakes.Counting.step, []
+
+    def fails_once(self: train_fakes.Counting, action: np.ndarray) -> Any:
+        calls.append(action)
+        return 1 / 0 if len(calls) == 3 else step(self, action)
+
+    monkeypatch.setattr(train_fakes.Counting, "step", fails_once)
+    assert main(["eval", counting, *COUNT, "1"]) == 0
+    out = capsys.readouterr().out
+    assert "  0%  evaluation 0/1 episodes" in out
+    assert "environment 0 was made anew, its episode is abandoned (error): " in out
+    assert "length 5 (min 5, max 5)" in out
+
+
 # One checkpoint for both backends
 
 
@@ -219,7 +238,7 @@ def test_a_run_that_changes_the_backend_goes_on(tmp_path: Path, capsys: pytest.C
     replay = Replay.restore(tmp_path / "replay", saved.info["replay"], saved.info["identity"]["replay_capacity"], 8, **with_latents)
     assert len(replay.state_dict()["records/reward"]) == 900
 
-    lines = [line for line in read_metrics(tmp_path / "metrics.jsonl") if "train/loss/total" in line]
+    lines = [line for line in logged(tmp_path) if "train/loss/total" in line]
     assert len(lines) == 431
     losses = {
         step: np.array([line["train/loss/total"] for line in lines if step < line["step"] <= step + 50]) for step in (250, 300, 550, 600)

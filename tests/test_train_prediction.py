@@ -8,6 +8,7 @@ import pytest
 from PIL import Image as Pillow
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from train_fakes import FakeLearner
+from train_runs import Make, run_quietly
 
 from conformance.problems import random_actions, random_observations, random_parameters, small_config, spaces
 from reference_numpy.world_model import open_loop
@@ -16,7 +17,7 @@ from train.backend import Learner, learner_class
 from train.envs import Environments, make_env
 from train.evaluation import play
 from train.logger import Logger
-from train.pictures import draw_predictions
+from train.pictures import draw_predictions, prune_pictures
 from train.prediction import CONTEXT, ROWS, STEPS, SequenceRecorder, predict, prediction_errors
 
 ACTIONS = {"action": Discrete((2,))}
@@ -318,3 +319,20 @@ def test_tensorboard_shows_the_animation(tmp_path: Path) -> None:
     with Pillow.open(path) as picture:
         assert (event.step, event.width, event.height) == (40, *picture.size)
     assert event.encoded_image_string == path.read_bytes()
+
+
+def test_the_pictures_of_the_newest_evaluations_stay(tmp_path: Path) -> None:
+    """Later ones than the evaluation's own are left from before a resume. What is not ours stays."""
+    for step in range(0, 1400, 100):
+        (tmp_path / f"{step:012d}-signals.png").touch()
+        (tmp_path / f"{step:012d}-camera.gif").touch()
+    (tmp_path / "notes-of-mine.png").touch()
+    prune_pictures(tmp_path, 1200)
+    assert sorted(path.name for path in tmp_path.glob("*.gif")) == [f"{step:012d}-camera.gif" for step in range(300, 1300, 100)]
+    assert sorted(path.name for path in tmp_path.glob("*.png"))[::10] == ["000000000300-signals.png", "notes-of-mine.png"]
+
+
+def test_a_run_keeps_the_pictures_of_its_newest_evaluations(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("train.pictures.KEPT", 2)
+    logdir = run_quietly(make(task="gym:CartPole-v1", steps=70, eval_every=20, eval_episodes=1)).options.logdir
+    assert sorted(path.name for path in (logdir / "predictions").iterdir()) == ["000000000040-signals.png", "000000000060-signals.png"]

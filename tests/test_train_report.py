@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from train import checkpoint
 from train.cli import main
+from train.errors import UserError
 from train.report import svg
 from train.report.page import render
 from train.report.results import headline, state
@@ -242,6 +244,13 @@ def test_log_directories_are_found_below_a_directory_and_once(tmp_path: Path) ->
     assert find_logdirs([b, tmp_path / "a", a]) == [b, a]
 
 
+def test_the_checkpoints_of_a_run_are_no_runs(tmp_path: Path) -> None:
+    checkpoint.save(tmp_path, 9, {}, {}, {}, keep=1)
+    for path in (tmp_path / "checkpoints", tmp_path / "checkpoints" / "000000000009"):
+        with pytest.raises(UserError, match=f"{path} holds no run"):
+            find_logdirs([path])
+
+
 def test_damaged_lines_are_counted(tmp_path: Path) -> None:
     path = make_run(tmp_path / "a", [{"step": 2, "b": 1.5}, {"step": 1, "b": NAN}], task="t")
     with (path / "metrics.jsonl").open("a") as file:
@@ -253,7 +262,7 @@ def test_damaged_lines_are_counted(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "content", ["{", "[]", '{"format": 1, "task": 3, "options": [], "starts": {"a": 1}, "machine": "x", "preflight": true}']
+    "content", ["{", "[]", "[" * 100_000, '{"format": 1, "task": 3, "options": [], "starts": {"a": 1}, "machine": "x", "preflight": true}']
 )
 def test_a_damaged_run_json_gives_a_page(tmp_path: Path, content: str) -> None:
     path = make_run(tmp_path / "a", [{"step": 2, "episode/return": 1.5}])
@@ -311,7 +320,12 @@ def full_run(path: Path, seed: int) -> Path:
     about = {
         "options": {"seed": seed, "steps": 100},
         "command": "train --backend jax --task gym:X",
-        "preflight": {"passed": True, "worst": 1.5e-7, "summary": "networks agree"},
+        "preflight": {
+            "passed": True,
+            "worst": 1.5e-7,
+            "summary": "networks agree",
+            "comparisons": [{"name": "encoder", "requirements": ["NET-2", "NET-12"], "share": 0.0625}, 3],
+        },
         "machine": {"processor": "A Processor", "cores": 2, "versions": {"jax": "1"}},
         "starts": [start, {**start, "step": 50, "versions": {"jax": "2"}}],
         "spaces": {"observations": {"image": {"kind": "image", "height": 8}}, "actions": {}},
@@ -328,6 +342,7 @@ def test_the_page_holds_what_the_runs_are(tmp_path: Path) -> None:
     document = Document(page(*paths))
     for text in ("gym:X", "2 seeds", "200 ± 0", "train --backend jax --task gym:X", "networks agree", "1.5e-07", "A Processor", "jax 2"):
         assert text in document.text, text
+    assert "encoderNET-2, NET-12passed6.25%" in document.text
     assert "not finite at step 10" in document.text
     assert "train: 75.0% on average" in document.text
     assert "image.gif is damaged" in document.text

@@ -2,12 +2,14 @@
 
 from collections.abc import Callable
 from contextlib import ExitStack
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from train_fakes import FakeLearner
 
 from train import loop, setup
+from train.logger import iterate_metrics
 from train.options import Options
 
 SMALL = {"deter": 8, "units": 4, "stoch": 2, "classes": 2, "batch_size": 2, "batch_length": 3, "envs": 2, "replay_capacity": 500}
@@ -26,6 +28,13 @@ def run_quietly(options: Options) -> Any:
 
 def batches() -> list[dict[str, np.ndarray]]:
     return [entry for kind, entry in FakeLearner.diary if kind == "train"]
+
+
+def logged(logdir: Path) -> list[dict[str, float]]:
+    """The lines of its metrics, none of which is damaged."""
+    lines = list(iterate_metrics(logdir / "metrics.jsonl"))
+    assert None not in lines
+    return [line for line in lines if line]
 
 
 def stored(state: Any) -> list[dict[str, np.ndarray]]:

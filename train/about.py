@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from spec import Config, Spaces, load_config, profiles, sizes
-from train.errors import UserError
+from train.errors import writing
+from train.files import read_json
 from train.machine import describe
 from train.options import Options, presets
 
@@ -35,15 +36,16 @@ def write_about(
     Raises:
       UserError: the disk refuses it.
     """
-    earlier = read_about(options.logdir) if resumed_at is not None else None
+    earlier = (resumed_at is not None and read_about(options.logdir)) or {}
     profile, size, changed = nearest(options.config)
     machine = describe()
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     start = {"time": now, "step": resumed_at or 0, "backend": options.backend, "device": device}
     start |= {name: machine[name] for name in ("accelerator", "python", "versions", "commit")}
+    known, starts = earlier.get("id"), earlier.get("starts")
     about = {
         "format": FORMAT,
-        "id": earlier["id"] if earlier else secrets.token_hex(8),
+        "id": known if isinstance(known, str) else secrets.token_hex(8),
         "command": shlex.join(command_line(options)),
         "task": options.task,
         "backend": options.backend,
@@ -57,7 +59,7 @@ def write_about(
         "spaces": spaces.to_json(),
         "preflight": dataclasses.asdict(preflight) if preflight else None,
         "machine": machine,
-        "starts": [*(earlier["starts"] if earlier else []), start],
+        "starts": [*(starts if isinstance(starts, list) else []), start],
     }
     text = json.dumps(about, indent=1) + "\n"
     _write(options.logdir / NAME, text)
@@ -65,12 +67,12 @@ def write_about(
 
 
 def read_about(logdir: Path) -> About | None:
-    """What run.json says; None if it is not there, damaged or of another format."""
+    """What run.json says; None if it is not there, damaged or of another format. No entry can be relied on."""
     try:
-        about = json.loads((logdir / NAME).read_text(encoding="utf-8"))
+        about = read_json(logdir / NAME)
     except (OSError, ValueError):
         return None
-    return about if isinstance(about, dict) and about.get("format") == FORMAT else None
+    return about if about.get("format") == FORMAT else None
 
 
 def command_line(options: Options) -> list[str]:
@@ -118,11 +120,9 @@ def _show(value: Any) -> str:
 
 def _write(path: Path, text: str) -> None:
     temporary = path.with_suffix(".tmp")
-    try:
+    with writing(path):
         with temporary.open("w", encoding="utf-8") as file:
             file.write(text)
             file.flush()
             os.fsync(file.fileno())
         temporary.replace(path)
-    except OSError as error:
-        raise UserError(f"cannot write {path}: {error.strerror}") from error

@@ -68,7 +68,10 @@ def save(logdir: Path, step: int, learner: Mapping[str, Any], loop: Mapping[str,
         (temporary / "run.json").write_text(json.dumps({"format": FORMAT, **info}, indent=2) + "\n", encoding="utf-8")
         seal(temporary, FILES)
         if final.exists():  # The same step again, as before and after the last evaluation.
-            final.rename(directory / f"{name_of(step)}.old")
+            old = directory / f"{name_of(step)}.old"
+            if old.exists():  # A process was killed before it could remove it.
+                shutil.rmtree(old)
+            final.rename(old)
         temporary.rename(final)
         flush(directory)
         kept = [path for path in candidates(logdir) if path.suffix == ""][:keep]

@@ -1,22 +1,28 @@
 """The learning curve of a run as a picture."""
 
+from array import array
 from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from train.logger import read_metrics
+from train.errors import writing
+from train.logger import iterate_metrics
 
 BLUE, ORANGE, GRAY = "#2563eb", "#ea580c", "#6b7280"
+EPISODE, EVALUATION, ERROR = "episode/return", "evaluation/return", "evaluation/return_standard_error"
 
 
 def draw_curve(logdir: Path, title: str, random_return: float | None) -> Path:
-    """Draws LOGDIR/curve.png from LOGDIR/metrics.jsonl: training episodes, their running mean, evaluations, the random policy."""
-    lines = read_metrics(logdir / "metrics.jsonl")
-    steps, returns = _column(lines, "episode/return")
-    eval_steps, eval_means = _column(lines, "evaluation/return")
-    _, eval_errors = _column(lines, "evaluation/return_standard_error")
+    """Draws LOGDIR/curve.png from LOGDIR/metrics.jsonl: training episodes, their running mean, evaluations, the random policy.
+
+    Raises:
+      UserError: the disk refuses it.
+    """
+    columns = _columns(logdir / "metrics.jsonl")
+    (steps, returns), (eval_steps, eval_means), (error_steps, errors) = (columns[name] for name in (EPISODE, EVALUATION, ERROR))
+    known = dict(zip(error_steps, errors, strict=True))
 
     figure = Figure(figsize=(8, 4.5), dpi=150, layout="constrained")
     axes = figure.subplots()
@@ -27,7 +33,7 @@ def draw_curve(logdir: Path, title: str, random_return: float | None) -> Path:
         axes.errorbar(
             eval_steps,
             eval_means,
-            yerr=eval_errors,
+            yerr=[known.get(step, 0.0) for step in eval_steps],
             color=ORANGE,
             marker="o",
             markersize=5,
@@ -47,14 +53,20 @@ def draw_curve(logdir: Path, title: str, random_return: float | None) -> Path:
     if axes.get_legend_handles_labels()[0]:
         axes.legend(frameon=False, fontsize=9)
     path = logdir / "curve.png"
-    figure.savefig(path)
+    with writing(path):
+        figure.savefig(path)
     return path
 
 
-def _column(lines: list[dict[str, float]], name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Steps and values of the lines that hold the name."""
-    pairs = [(line["step"], line[name]) for line in lines if name in line]
-    return np.array([step for step, _ in pairs]), np.array([value for _, value in pairs])
+def _columns(path: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Steps and values of what is drawn. The lines of a long run do not fit in memory."""
+    columns = {name: (array("d"), array("d")) for name in (EPISODE, EVALUATION, ERROR)}
+    for line in iterate_metrics(path):
+        for name, (steps, values) in columns.items():
+            if line and name in line:
+                steps.append(line["step"])
+                values.append(line[name])
+    return {name: (np.array(steps), np.array(values)) for name, (steps, values) in columns.items()}
 
 
 def _running_mean(values: np.ndarray) -> np.ndarray:

@@ -64,6 +64,12 @@ def play_episodes(envs: Environments, act: Act, episodes: int, seeds: list[int],
         record = envs.step(act(record))
 
 
+def report_failures(envs: Environments, say: Callable[[str], None]) -> None:
+    """Says which environments had to be made anew since the last call."""
+    for failure in envs.take_failures():
+        say(f"environment {failure.worker} was made anew, its episode is abandoned ({failure.kind}): {failure.message}")
+
+
 class Agent:
     """Acts as the learner does, with a carry of its own that starts at zero.
 

@@ -19,7 +19,7 @@ from tensorboard.compat.proto.summary_pb2 import Summary
 from tensorboard.summary.writer.event_file_writer import EventFileWriter
 
 from train.about import About
-from train.errors import UserError
+from train.errors import UserError, writing
 
 PLAIN_EVERY = 10.0  # seconds between lines where there is no terminal
 
@@ -43,46 +43,51 @@ class Logger:
 
     def __init__(self, logdir: Path, position: int | None = None, *, wandb: str | None = None, about: About | None = None) -> None:
         self._path = logdir / "metrics.jsonl"
-        try:
+        with writing(self._path):
             self.warnings = _cut(self._path, position or 0)
             self._file = self._path.open("ab")
-        except OSError as error:
-            raise UserError(f"cannot write {self._path}: {error.strerror}") from error
-        self._tensorboard = _TensorBoard(logdir, _last_step(self._path))
+        with writing(logdir):
+            self._tensorboard = _TensorBoard(logdir, _last_step(self._path))
         self._wandb = _Wandb(logdir, wandb, about or {}) if wandb else None
 
     def write(self, step: int, seconds: float, metrics: Mapping[str, float]) -> None:
         values = {name: float(value) for name, value in metrics.items()}
         line = json.dumps({"step": step, "seconds": round(seconds, 3), **values}) + "\n"
-        try:
+        with writing(self._path):
             self._file.write(line.encode())
             self._file.flush()
-        except OSError as error:
-            raise UserError(f"cannot write {self._path}: {error.strerror}") from error
-        self._tensorboard.scalars(values, step)
+        with writing(self._path.parent):
+            self._tensorboard.scalars(values, step)
         if self._wandb:
             self._wandb.log(values, step)
 
     def picture(self, name: str, picture: Picture, step: int) -> None:
         """An image for TensorBoard and Weights & Biases: a PNG or GIF file, or uint8 [H, W], [H, W, 1] or [H, W, 3]."""
-        self._tensorboard.image(name, picture, step)
+        with writing(self._path.parent):
+            self._tensorboard.image(name, picture, step)
         if self._wandb:
             self._wandb.log_picture(name, picture, step)
 
     def position(self) -> int:
         """The size of metrics.jsonl in bytes, all of which are on the disk: for the checkpoint."""
-        try:
+        with writing(self._path):
             self._file.flush()
             os.fsync(self._file.fileno())
-        except OSError as error:
-            raise UserError(f"cannot write {self._path}: {error.strerror}") from error
         return self._file.tell()
 
     def close(self) -> None:
-        self._file.close()
-        self._tensorboard.close()
+        """Writes what is still under way.
+
+        Raises:
+          UserError: the disk refuses it.
+        """
         if self._wandb:
             self._wandb.close()
+        with writing(self._path.parent):
+            try:
+                self._file.close()
+            finally:
+                self._tensorboard.close()
 
 
 def _cut(path: Path, position: int) -> list[str]:
@@ -187,7 +192,7 @@ def _png(image: np.ndarray) -> bytes:
 
 
 def iterate_metrics(path: Path) -> Iterator[dict[str, float] | None]:
-    """The lines of a metrics.jsonl one by one: the numbers of each by name, or None for a line that is damaged."""
+    """The lines of a metrics.jsonl one by one: the numbers of each by name, or None for a line that is damaged or cut off."""
     if path.exists():
         with path.open("rb") as file:
             yield from map(_numbers, file)
@@ -196,15 +201,10 @@ def iterate_metrics(path: Path) -> Iterator[dict[str, float] | None]:
 def _numbers(text: bytes) -> dict[str, float] | None:
     """The numbers of a line by name; None if it is damaged."""
     try:
-        line = {name: value for name, value in json.loads(text).items() if type(value) in (int, float)}
-        return line if math.isfinite(line["step"]) else None
+        line = {name: float(value) for name, value in json.loads(text).items() if type(value) in (int, float)}
+        return line if 0 <= line["step"] < math.inf and 0 <= line.get("seconds", 0.0) < math.inf else None
     except (ValueError, KeyError, AttributeError, RecursionError, OverflowError):
         return None
-
-
-def read_metrics(path: Path) -> list[dict[str, float]]:
-    """The lines of a metrics.jsonl; damaged ones are left out, as is a last one that was cut off in writing."""
-    return [line for line in iterate_metrics(path) if line is not None]
 
 
 class Display:

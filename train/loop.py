@@ -13,9 +13,10 @@ from reference_numpy.training_loop import can_train, derive_seed
 from train import resume
 from train.backend import Learner
 from train.envs import Record
+from train.evaluation import report_failures
 from train.finite import finite_action, settle
 from train.options import Options
-from train.schedule import Schedule, finish, log_episode, log_failures
+from train.schedule import Schedule, finish, log_episode
 from train.setup import prepare
 from train.state import Run, TrainStep
 
@@ -40,12 +41,13 @@ def train(run: Run) -> bool:
     """Acts, remembers and learns until the budget of steps is used up. Returns False if Ctrl-C ended it; then a checkpoint is written."""
     schedule = Schedule(run)
     with _interruptible(run.interrupted):
+        schedule.evaluate(run)
         while run.step < run.options.steps and not run.interrupted:
             act(run)
             schedule.attend(run)
             with run.clock.part("environments"):
                 run.record = run.envs.finish()
-            log_failures(run, run.envs)
+            report_failures(run.envs, run.display.say)
             schedule.save(run)
         if run.interrupted:
             path = resume.save(run)
@@ -90,14 +92,13 @@ def learn(run: Run) -> None:
     number = run.counters.train_steps
     seed = derive_seed(run.options.seed, "train", number)
     if not run.warm:
-        run.display.phase("the first train step, which JAX compiles")
+        run.display.phase("the first train step" + (", which JAX compiles" if run.options.backend == "jax" else ""))
         run.warm = True
     with run.clock.part("train"):
         called = time.perf_counter()
         metrics, latents = run.learner.train_step(batch, seed)
-        run.replay.write_back(
-            ids, latents, lambda: run.clock.computed(called), metrics["skipped"]
-        )  # Waits until the step before is computed.
+        # Waits until the step before is computed.
+        run.replay.write_back(ids, latents, lambda: run.clock.computed(called), metrics["skipped"])
         settle(run)
     run.counters.train_steps += 1
     run.unsettled = TrainStep(number, seed, batch, metrics)

@@ -6,6 +6,7 @@ is white, on a dark page too.
 
 import dataclasses
 import math
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
@@ -32,6 +33,7 @@ SMALLEST_TILE = 64  # pixels; smaller images are enlarged by a whole factor
 BORDER, GAP = 3, 6  # pixels
 LEFT, TOP, SMALLEST_WIDTH = 52, 24, 200  # pixels of an animation, for its words
 MILLISECONDS, PAUSE = 100, 1000  # that a frame lasts, and the last one
+KEPT = 10  # evaluations whose pictures stay on the disk
 
 
 def draw_predictions(
@@ -58,6 +60,15 @@ def draw_predictions(
     paths["signals"] = directory / f"{step:012d}-signals.png"
     _draw_signals(signals, starts[longest[0]], context, f"step {step:,}").savefig(paths["signals"])
     return paths
+
+
+def prune_pictures(directory: Path, step: int) -> None:
+    """Removes all pictures but those of the newest `KEPT` evaluations up to `step`; later ones are from before a resume."""
+    pictures = {path: path.name[:12] for path in directory.iterdir() if re.fullmatch(r"\d{12}-.+\.(png|gif)", path.name)}
+    kept = sorted({name for name in pictures.values() if int(name) <= step})[-KEPT:]
+    for path, name in pictures.items():
+        if name not in kept:
+            path.unlink()
 
 
 def _longest_episodes(is_first: np.ndarray) -> np.ndarray:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from safetensors import SafetensorError
 from safetensors.numpy import save_file
 
 from reference_numpy import agent, training_loop
@@ -165,5 +166,5 @@ def save(path: Path, saved: SavedAgent) -> None:
         seal(temporary, (PARAMETERS, DESCRIPTION))
         temporary.rename(path)
         flush(path.parent)
-    except OSError as error:
+    except (OSError, SafetensorError) as error:
         raise UserError(f"cannot write the policy {path}: {error}") from error

@@ -16,6 +16,7 @@ from train.logger import Display
 from train.options import Options
 from train.state import Counters, Means, Run
 
+COUNTERS = {name: type(value) for name, value in dataclasses.asdict(Counters()).items()}
 FROM_BOUNDARY = "new episodes begin, those under way when it was saved are abandoned"
 
 
@@ -89,6 +90,7 @@ def restore_environments(saved: Checkpoint, envs: Environments, display: Display
     arrays = saved.loop
     entries = enumerate(saved.info["environments"])
     histories = [History.from_json(entry, arrays[name]) if entry and (name := f"actions/{i}") in arrays else None for i, entry in entries]
+    display.phase("repeating the episodes under way")
     record = envs.restore(histories)
     if record is None:
         display.say(f"the environments cannot be restored: {FROM_BOUNDARY}")
@@ -133,7 +135,9 @@ def _require_sound(saved: Checkpoint) -> None:
         "identity": isinstance(info.get("identity"), dict),
         "spaces": _is_of(info.get("spaces"), lambda entries: isinstance(entries, dict)),
         "backend": isinstance(info.get("backend"), str),
-        "counters": _is_of(info.get("counters"), _is_count) and info["counters"].keys() == dataclasses.asdict(Counters()).keys(),
+        "counters": isinstance(info.get("counters"), dict)
+        and {name: type(value) for name, value in info["counters"].items()} == COUNTERS
+        and all(0 <= value < 2**63 for value in info["counters"].values()),
         "environments": isinstance(info.get("environments"), list)
         and all(entry is None or (_is_of(entry, _is_count) and entry.keys() == {"seed", "episode"}) for entry in info["environments"]),
         "replay_ratio": _is_of(info.get("replay_ratio"), lambda value: value is None or isinstance(value, str | int)),
@@ -167,7 +171,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _is_count(value: Any) -> bool:
-    return _is_number(value) and 0 <= value < 2**63
+    return type(value) is int and 0 <= value < 2**63
 
 
 def _prefixed(prefix: str, arrays: Mapping[str, Any]) -> Arrays:

@@ -11,11 +11,12 @@ import numpy as np
 from reference_numpy.training_loop import derive_seed
 from train import resume
 from train.curve import draw_curve
-from train.envs import Environments, Record
-from train.evaluation import Agent, Interrupted, evaluate
+from train.envs import Record
+from train.errors import writing
+from train.evaluation import Agent, Interrupted, evaluate, report_failures
 from train.finite import finite_action, mean_metrics
 from train.logger import duration
-from train.pictures import draw_predictions
+from train.pictures import draw_predictions, prune_pictures
 from train.prediction import SequenceRecorder, predict, prediction_errors
 from train.state import Run
 
@@ -26,7 +27,6 @@ class Schedule:
     def __init__(self, run: Run) -> None:
         self._clock = self._logged_at = self._saved_at = time.monotonic()
         self._logged = dataclasses.replace(run.counters)
-        self._evaluations_due = _evaluations_due(run)
 
     def attend(self, run: Run) -> None:
         """To be called after every step of the environments."""
@@ -36,10 +36,11 @@ class Schedule:
         if now - self._logged_at >= run.options.log_every:
             with run.clock.part("log"):
                 self._log(run, now)
-        if run.interrupted:
-            return
-        if _evaluations_due(run) > self._evaluations_due and run.step < run.options.steps:  # At the end `finish` does it.
-            self._evaluations_due = _evaluations_due(run)
+        self.evaluate(run)
+
+    def evaluate(self, run: Run) -> None:
+        """Plays an evaluation if one is due. To be called before the first step too: a resumed run may have been interrupted in one."""
+        if _evaluation_is_due(run) and not run.interrupted:
             with run.clock.part("evaluation"):
                 run_evaluation(run)
 
@@ -101,8 +102,10 @@ def _facts(run: Run, steps: float, train_steps: float) -> Iterator[str]:
     yield f"{train_steps:.1f} train steps/s"
 
 
-def _evaluations_due(run: Run) -> int:
-    return run.step // run.options.eval_every if run.options.eval_every else 0
+def _evaluation_is_due(run: Run) -> bool:
+    """Whether a multiple of --eval-every has been reached since the last evaluation; at the end `finish` evaluates."""
+    every, last = run.options.eval_every, run.evaluation["step"] if run.evaluation else 0
+    return every > 0 and run.step // every > last // every and run.step < run.options.steps
 
 
 def log_episode(run: Run, score: float, length: int) -> None:
@@ -110,12 +113,6 @@ def log_episode(run: Run, score: float, length: int) -> None:
     run.counters.episodes += 1
     run.returns.append(score)
     run.logger.write(run.step, run.counters.seconds, {"episode/return": score, "episode/length": length})
-
-
-def log_failures(run: Run, envs: Environments) -> None:
-    """Environments that had to be made anew."""
-    for failure in envs.take_failures():
-        run.display.say(f"environment {failure.worker} was made anew, its episode is abandoned ({failure.kind}): {failure.message}")
 
 
 def run_evaluation(run: Run) -> None:
@@ -139,13 +136,14 @@ def run_evaluation(run: Run) -> None:
     except Interrupted:
         return
     finally:
-        log_failures(run, run.test_envs)
+        report_failures(run.test_envs, run.display.say)
     errors = show_predictions(run, recorder)
     counters.evaluations += 1
     counters.evaluation_steps = agent.step
-    error = float(np.std(returns) / math.sqrt(len(returns)))
     run.evaluation = {"step": run.step, "return": float(np.mean(returns))}
-    metrics = {"return": run.evaluation["return"], "return_standard_error": error, "return_min": min(returns), "return_max": max(returns)}
+    metrics = {"return": run.evaluation["return"], "return_min": min(returns), "return_max": max(returns)}
+    if len(returns) > 1:
+        metrics["return_standard_error"] = float(np.std(returns, ddof=1)) / math.sqrt(len(returns))
     run.logger.write(run.step, counters.seconds, {f"evaluation/{name}": value for name, value in metrics.items()} | errors)
 
 
@@ -156,7 +154,11 @@ def show_predictions(run: Run, recorder: SequenceRecorder) -> dict[str, float]:
         return {}
     spaces, seed = run.envs.spaces, derive_seed(run.options.seed, "prediction", run.counters.evaluations)
     predicted = predict(run.learner, spaces, truth, seed)
-    for name, path in draw_predictions(run.options.logdir / "predictions", run.step, spaces, truth, predicted).items():
+    directory = run.options.logdir / "predictions"
+    with writing(directory):
+        pictures = draw_predictions(directory, run.step, spaces, truth, predicted)
+        prune_pictures(directory, run.step)
+    for name, path in pictures.items():
         run.logger.picture(f"prediction/{name}", path, run.step)
     return prediction_errors(spaces, truth, predicted)
 

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
 def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -> Run:
     """Everything that can go wrong is tried here, the cheap things first. What must be closed is left to the stack."""
-    _require_writable(options)
     _require_trainable(options)
+    _hold_logdir(options, stack)
     display = stack.enter_context(Display(options.steps))
     saved = _find_checkpoint(options, display)
     learner_type = learner or import_learner(options.backend)
@@ -84,14 +84,25 @@ def _begin(options: Options, envs: Environments, starts: int) -> Record:
     return envs.reset([derive_seed(options.seed, "environment", worker + envs.count * starts) for worker in range(envs.count)])
 
 
-def _require_writable(options: Options) -> None:
+def _hold_logdir(options: Options, stack: ExitStack) -> None:
+    """Locks the log directory until the run ends, however it ends: two processes would cut each other's files.
+
+    Raises:
+      UserError: another process holds it, or it cannot be written.
+    """
+    import fcntl  # Not on Windows, where `train eval` needs this module too.
+
     try:
         options.logdir.mkdir(parents=True, exist_ok=True)
-        probe = options.logdir / ".writable"
-        probe.touch()
-        probe.unlink()
+        lock = stack.enter_context((options.logdir / ".lock").open("w"))
     except OSError as error:
         raise UserError(f"cannot write to the log directory {options.logdir}: {error.strerror}; choose another with --logdir") from error
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        raise UserError(f"another process is training in {options.logdir}; let it end, or choose another with --logdir") from error
+    except OSError:
+        pass  # Some network file systems have no locks: there it is left to the user.
 
 
 def _require_trainable(options: Options) -> None:

@@ -8,7 +8,6 @@ import statistics
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -17,8 +16,9 @@ from train.backend import Learner
 from train.checkpoint import open_checkpoint
 from train.cli import Parser
 from train.envs import Environments, Record, is_slow, make_env
-from train.errors import UserError
-from train.evaluation import Agent, Episode, play_episodes
+from train.errors import UserError, writing
+from train.evaluation import Agent, Episode, play_episodes, report_failures
+from train.logger import Display
 from train.options import Options
 from train.saved_agent import SavedAgent, agent_of
 from train.setup import import_learner, make_learner
@@ -61,7 +61,8 @@ def main(arguments: Sequence[str]) -> int:
             learner.load_state_dict(checkpoint.learner)
         except ValueError as error:
             raise UserError(f"the checkpoint {checkpoint.path} does not fit this version: {error}") from error
-        episodes = play(learner, envs, values.episodes, options.seed)
+        with Display(values.episodes) as display:
+            episodes = play(learner, envs, values.episodes, options.seed, display)
     summary = summarize(episodes)
     where = f"{options.backend} on {learner.device}"
     print(f"{checkpoint.path}: {options.task}, step {saved.info['step']:,}; {len(episodes)} episodes with {where}, seed {values.seed}")
@@ -70,25 +71,33 @@ def main(arguments: Sequence[str]) -> int:
         run = {"checkpoint": str(checkpoint.path), "task": options.task, "step": saved.info["step"], "trained_by": saved.info["backend"]}
         run |= {"backend": options.backend, "device": learner.device, "seed": values.seed}
         lists = {"returns": [episode.score for episode in episodes], "lengths": [episode.length for episode in episodes]}
-        _write(values.json, {**run, **summary, **lists})
+        with writing(values.json):
+            values.json.write_text(json.dumps({**run, **summary, **lists}, indent=2) + "\n", encoding="utf-8")
     return 0
 
 
-def play(learner: Learner, envs: Environments, episodes: int, seed: int) -> list[Episode]:
+def play(learner: Learner, envs: Environments, episodes: int, seed: int, display: Display) -> list[Episode]:
     """Whole episodes of the learner, with the seeds of a run's first evaluation. seed: takes the place of the run's. [LOOP-19], [LOOP-26]
 
     Raises:
       UserError: an action that is not finite, or an episode that does not end.
     """
-    agent = Agent(learner, envs, seed, 0)
+    agent, ended = Agent(learner, envs, seed, 0), 0
 
     def act(record: Record) -> np.ndarray:
+        nonlocal ended
+        ended += int(record["is_last"].sum())
+        display.phase("evaluation", min(ended, episodes), episodes, "episodes")
         action = np.asarray(agent(record), np.float32)
         if not np.isfinite(action).all():  # [LOOP-12]
             raise UserError(f"at policy step {agent.step} the action is not finite: the parameters of the checkpoint are broken")
         return action
 
-    return play_episodes(envs, act, episodes, [derive_seed(seed, "evaluation_environment", worker) for worker in range(envs.count)])
+    seeds = [derive_seed(seed, "evaluation_environment", worker) for worker in range(envs.count)]
+    try:
+        return play_episodes(envs, act, episodes, seeds)
+    finally:
+        report_failures(envs, display.say)
 
 
 def summarize(episodes: Sequence[Episode]) -> dict[str, float | None]:
@@ -147,10 +156,3 @@ def _task_without_code(saved: SavedAgent) -> str:
     if suite in ("gym", "dmc", "dmc_vision") and ":" not in name:
         return task
     raise UserError(f"the checkpoint names the task {task}, which runs code of that module; if you trust it, add --task {task}")
-
-
-def _write(path: Path, content: Mapping[str, Any]) -> None:
-    try:
-        path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"cannot write {path}: {error.strerror}") from error

@@ -112,7 +112,20 @@ def _preflight(run: RunLog) -> str:
     word = '<span class="pass">Passed</span>' if passed else '<span class="fail">Failed</span>'
     worst = run.preflight.get("worst")
     deviation = f" Worst deviation {worst:.3g}, relative to the size of what deviates." if isinstance(worst, int | float) else ""
-    return f"<p>{word}: {escape(show(run.preflight.get('summary')))}.{deviation}</p>"
+    summary = f"<p>{word}: {escape(show(run.preflight.get('summary')))}.{deviation}</p>"
+    comparisons = run.preflight.get("comparisons")
+    rows = [_comparison(entry) for entry in comparisons if isinstance(entry, dict)] if isinstance(comparisons, list) else []
+    if not rows:
+        return summary
+    header = ["compared with the reference", "requirements", "", "worst deviation, share of what is allowed"]
+    return summary + details(f"All {len(rows)} comparisons", table(header, rows, numbers=(3,)))
+
+
+def _comparison(entry: dict[str, object]) -> list[str]:
+    share, requirements = entry.get("share"), entry.get("requirements")
+    ids = ", ".join(map(show, requirements)) if isinstance(requirements, list) else ""
+    shown = f"{share:.2%}" if isinstance(share, int | float) else ""
+    return [cell(show(entry.get("name")), "mono"), cell(ids), cell("passed", "pass"), cell(shown, "number")]
 
 
 def _starts(run: RunLog) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 
 from train.about import read_about
 from train.errors import UserError
+from train.files import SUMS, read_json
 from train.logger import iterate_metrics
 
 # Of the options, beside task, backend and hyperparameters, those that change what is learned: runs of one group agree in all of them.
@@ -107,7 +108,8 @@ def find_logdirs(paths: Sequence[Path]) -> list[Path]:
 
 
 def _is_logdir(path: Path) -> bool:
-    return (path / "metrics.jsonl").is_file() or (path / "run.json").is_file()
+    """A checkpoint has a run.json too, and checksums."""
+    return (path / "metrics.jsonl").is_file() or ((path / "run.json").is_file() and not (path / SUMS).exists())
 
 
 def read_run(logdir: Path) -> RunLog:
@@ -164,7 +166,7 @@ def _from_checkpoint(logdir: Path) -> dict[str, Any]:
     """What the newest checkpoint says about a run that has no run.json."""
     for path in reversed(_checkpoints(logdir)):
         try:
-            info = json.loads((path / "run.json").read_text(encoding="utf-8"))
+            info = read_json(path / "run.json")
             identity = dict(info["identity"])
             options = {name: identity.pop(name) for name in ("task", "seed", *LEARNING_OPTIONS) if name in identity}
             about = {"task": options.pop("task", ""), "backend": info.get("backend"), "spaces": info.get("spaces")}
