@@ -53,9 +53,7 @@ def telling_checks(checks: Iterable[Check]) -> list[Check]:
     return [check for check in checks if not told.isdisjoint(check.requirements)]
 
 
-def judge(
-    check: Check, adapter: object, edition: Edition, dtype: str, seed: int = 0, examples: int = 25, shrink: bool = True
-) -> Result:
+def judge(check: Check, adapter: object, edition: Edition, dtype: str, seed: int = 0, examples: int = 25, shrink: bool = True) -> Result:
     """Runs one check as the edition has it; with the status "not in edition" where that is not known."""
     if lacking := missing(adapter, check):
         return not_offered(check, lacking)
@@ -220,3 +218,16 @@ def alike(fits: Iterable[Fit], chosen: Fit) -> list[str]:
         for one in fits
         if one is not chosen and all(one.statuses[name] == chosen.statuses[name] for name in one.judged & chosen.judged)
     ]
+
+
+def to_json(fits: list[Fit], edition: str) -> dict[str, Any]:
+    """What the reports say of the fits of a candidate that was judged in an edition: the schema's `fit`."""
+    chosen = next(one for one in fits if one.edition == edition)
+    better = best(fits)
+    return {
+        "editions": [
+            {"edition": one.edition, "passed": len(one.passed), "judged": len(one.judged), "offered": len(one.statuses)} for one in fits
+        ],
+        "alike": alike(fits, chosen),
+        "better": better.edition if fits_better(better, chosen) else None,
+    }
