@@ -24,6 +24,7 @@ from spec import Edition, editions
 NOT_JUDGED = "not in edition"
 REACH_EXAMPLES = 5  # cases that show which functions a check reaches
 FIT_EXAMPLES = 5
+GRADIENTS = {"gradients", "gradients_given", "loss_derivatives"}
 PREFERRED = ("paper", "2024-12", "2024-04", "2023")
 """The order of editions that fit equally well."""
 
@@ -48,9 +49,12 @@ def own_reference(edition: str) -> Mutant | None:
 
 
 def telling_checks(checks: Iterable[Check]) -> list[Check]:
-    """Those by which editions can be told apart: of a requirement that an edition has otherwise, by a mutant or by a setting."""
+    """Those by which editions can be told apart: of a requirement that an edition has otherwise, by a mutant or by a setting.
+
+    Gradients are left out: they are slow, and tell nothing that the losses do not.
+    """
     told = {name for edition in editions().values() for name, difference in edition.differs.items() if difference.is_modelled}
-    return [check for check in checks if not told.isdisjoint(check.requirements)]
+    return [check for check in checks if not told.isdisjoint(check.requirements) and GRADIENTS.isdisjoint(check.uses)]
 
 
 def judge(check: Check, adapter: object, edition: Edition, dtype: str, seed: int = 0, examples: int = 25, shrink: bool = True) -> Result:

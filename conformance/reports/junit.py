@@ -10,7 +10,7 @@ _FORBIDDEN = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]"
 
 
 def render(data: Data) -> str:
-    """What is not offered or not judged is skipped, and so are expected failures. What else stands against the run fails in the suite `verdict`."""
+    """Expected failures are skipped, and what is not judged. What else stands against the run is a failure in the suite `verdict`."""
     suites = ElementTree.Element("testsuites", name=_text(f"conformance of {summary.label(data)}"))
     by_row: dict[str, list[ElementTree.Element]] = {}
     for name, check in data["checks"].items():

@@ -94,6 +94,8 @@ def edition(data: Data) -> list[str]:
     found = editions().get(data["edition"])
     title = f" ({found.title})" if found else ""
     reason = {"given": "as asked", "claimed": "as it claims", "best fit": "which fits best"}[data["choice"]]
+    if data["choice"] == "given" and (claimed := data["implementation"]["edition"]):
+        reason += f"; it claims {claimed}"
     lines = [f"Judged as the edition {data['edition']}{title}, {reason}."]
     if (fit := data["fit"]) is None:
         return lines
