@@ -6,6 +6,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from conformance.adapter import COLUMNS
 from conformance.candidate import candidate, remarks
 from conformance.check import DTYPES, Check
 from conformance.diagnosis import diagnose
@@ -17,6 +18,7 @@ from conformance.reports import badge, html, junit, markdown, terminal
 from conformance.results import FAILING, Data, identity, result_data, write, write_text
 from spec import editions, find_edition
 
+COLUMN_EDITION = "paper"  # of our own columns, unless another is given: they follow the configuration, so there is nothing to find out
 RENDERED: dict[str, Callable[[Data], str]] = {
     "markdown": markdown.render,
     "junit": junit.render,
@@ -64,7 +66,8 @@ def main(console: Console, options: argparse.Namespace) -> int:
         for remark in remarks(adapter):
             console.print(remark, markup=False, highlight=False)
         implementation = identity(adapter, options.candidate or options.process or "")
-        named = options.edition or _claimed(implementation["edition"])
+        asked = options.edition or (COLUMN_EDITION if options.candidate in COLUMNS else None)
+        named = asked or _claimed(implementation["edition"])
         fits = [] if named else _fit(console, checks, adapter, options)
         settings = Settings(
             candidate=options.candidate or options.process or "",
@@ -76,7 +79,7 @@ def main(console: Console, options: argparse.Namespace) -> int:
         if named and telling_checks(result.check for result in results if result.status in FAILING):
             fits = _fit(console, checks, adapter, options)
         diagnoses = _diagnoses(console, adapter, results, settings)
-        choice = "given" if options.edition else "claimed" if named else "best fit"
+        choice = "given" if asked else "claimed" if named else "best fit"
         data = result_data(
             settings, implementation, results, expected, diagnoses, choice, to_json(fits, settings.edition) if fits else None
         )

@@ -94,7 +94,7 @@ def edition(data: Data) -> list[str]:
     found = editions().get(data["edition"])
     title = f" ({found.title})" if found else ""
     reason = {"given": "as asked", "claimed": "as it claims", "best fit": "which fits best"}[data["choice"]]
-    if data["choice"] == "given" and (claimed := data["implementation"]["edition"]):
+    if data["choice"] == "given" and (claimed := data["implementation"]["edition"]) not in (None, data["edition"]):
         reason += f"; it claims {claimed}"
     lines = [f"Judged as the edition {data['edition']}{title}, {reason}."]
     if (fit := data["fit"]) is None:
