@@ -7,11 +7,12 @@ from collections.abc import Iterable
 
 from conformance.check import CHECKS, Call, CandidateLost, Check, Deviation, Run, Worst
 from conformance.requirements import requirements
+from spec import editions
 
 
 @dataclasses.dataclass(frozen=True)
 class Result:
-    """What one check found. status: "pass", "fail", "error" (the candidate raised) or "not offered".
+    """What one check found. status: "pass", "fail", "error" (the candidate raised), "not offered" or "not in edition" (not judged).
 
     call: where it failed, the last call of the candidate; None where it was not called.
     """
@@ -32,11 +33,16 @@ class Settings:
     process: bool
     dtype: str
     device: str | None
-    profile: str
+    edition: str
     only: str
     seed: int
     examples: int
     at_least: int
+
+    @property
+    def profile(self) -> str:
+        """The name of the edition's values."""
+        return editions()[self.edition].profile
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,7 +58,7 @@ class Row:
         for status in ("error", "fail", "not offered"):
             if status in statuses:
                 return status
-        return "pass" if self.results else "no check"
+        return next((status for status in ("pass", "not in edition") if status in statuses), "no check")
 
     @property
     def worst(self) -> Worst:
@@ -64,10 +70,14 @@ def missing(adapter: object, check: Check) -> list[str]:
     return [name for name in check.uses if not callable(getattr(adapter, name, None))]
 
 
+def not_offered(check: Check, lacking: Iterable[str]) -> Result:
+    return Result(check, "not offered", Worst(), 0, f"the adapter does not offer {', '.join(lacking)}")
+
+
 def run_check(check: Check, adapter: object, dtype: str, profile: str, seed: int = 0, examples: int = 25, shrink: bool = True) -> Result:
     """Runs one check; what the candidate raises becomes a result."""
     if lacking := missing(adapter, check):
-        return Result(check, "not offered", Worst(), 0, f"the adapter does not offer {', '.join(lacking)}")
+        return not_offered(check, lacking)
     return finish(check, Run(adapter, dtype, profile, seed, examples, shrink))
 
 

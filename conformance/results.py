@@ -36,11 +36,12 @@ def versions() -> dict[str, str]:
     return {"python": platform.python_version(), **{name: installed[name] for name in names if name in installed}}
 
 
-def identity(adapter: object, settings: Settings) -> Data:
+def identity(adapter: object, candidate: str) -> Data:
     """Name, version and claimed edition of the candidate. One of our own columns has the version of the kit, and claims none."""
     if isinstance(adapter, ForeignAdapter):
-        return {"name": adapter.name, "version": adapter.version, "edition": adapter.edition()}
-    return {"name": settings.candidate, "version": versions().get("dreamer-spec", ""), "edition": None}
+        claimed = adapter.edition()
+        return {"name": adapter.name, "version": adapter.version, "edition": None if claimed is None else str(claimed)}
+    return {"name": candidate, "version": versions().get("dreamer-spec", ""), "edition": None}
 
 
 def result_data(
@@ -49,12 +50,16 @@ def result_data(
     results: Iterable[Result],
     expected: ExpectedFailures,
     diagnoses: Sequence[Mapping[str, Any]] = (),
+    choice: str = "given",
+    fit: Data | None = None,
 ) -> Data:
     """A run and everything that was found.
 
     Args:
       implementation: of `identity`.
       diagnoses: of the mutants that the candidate behaves like, each as the schema's `diagnosis` says.
+      choice: how the edition was chosen: "given", "claimed" or "best fit".
+      fit: how well each edition fits, as the schema's `fit` says; None where that was not asked.
 
     `share` is the worst deviation as a share of the allowed one; it is null where what failed has no size.
     """
@@ -63,6 +68,9 @@ def result_data(
         "format": FORMAT,
         "date": time.strftime("%Y-%m-%d", time.gmtime()),
         **dataclasses.asdict(settings),
+        "profile": settings.profile,
+        "choice": choice,
+        "fit": fit,
         "implementation": dict(implementation),
         "versions": versions(),
         "verdict": verdict(settings, results, expected),

@@ -21,7 +21,8 @@ from pathlib import Path
 from typing import Any
 
 from conformance.commands.mutants import is_named
-from spec import benchmarks, hyperparameters, profiles, sizes
+from conformance.requirements import chapter_of, requirements
+from spec import Edition, benchmarks, editions, hyperparameters, profiles, sizes
 from train.report import catalogue
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -50,11 +51,40 @@ def hyperparameter_table() -> str:
     """Every hyperparameter with its value in each profile."""
     rows = []
     for name, entry in hyperparameters().items():
-        official = profiles()["official"].get(name, entry["value"])
-        symbol = entry.get("symbol", "")
-        values = [_value(entry["value"]), _value(official) if official != entry["value"] else ""]
-        rows.append([f"`{name}`", symbol, *values, entry["help"], entry["source"]])
-    return markdown_table(["name", "symbol", "paper", "official, where it differs", "meaning", "source"], rows)
+        others = "; ".join(f"{profile}: {_value(values[name])}" for profile, values in profiles().items() if name in values)
+        rows.append([f"`{name}`", entry.get("symbol", ""), _value(entry["value"]), others, entry["help"], entry["source"]])
+    return markdown_table(["name", "symbol", "paper", "others, where they differ", "meaning", "source"], rows)
+
+
+def edition_list() -> str:
+    """What each edition is."""
+    rows = [[f"`{edition.name}`", edition.title, edition.source, edition.date, f"`{edition.profile}`"] for edition in editions().values()]
+    return markdown_table(["edition", "what it is", "source", "date", "profile"], rows)
+
+
+def edition_table(chapter: str = "") -> str:
+    """The requirements that some edition has otherwise, of one chapter (`spec/07-returns.md`) or of all, and what holds in each."""
+    found = {name for edition in editions().values() for name in edition.differs}
+    names = [name for name in requirements() if name in found and chapter in ("", chapter_of(name))]
+    rows = [[name, *(_in_edition(edition, name) for edition in editions().values())] for name in names]
+    return markdown_table(["requirement", *editions()], rows)
+
+
+def _in_edition(edition: Edition, requirement: str) -> str:
+    if (difference := edition.differs.get(requirement)) is None:
+        return "holds"
+    values = (f"`{name}` {_value(profiles()[edition.profile][name])}" for name in difference.settings)
+    return " ".join([difference.instead, *(["Not judged."] if not difference.is_modelled else []), ", ".join(values)]).strip()
+
+
+def chapters_with_editions() -> list[str]:
+    return sorted({chapter_of(name) for edition in editions().values() for name in edition.differs})
+
+
+def edition_beyond() -> str:
+    """The functions that editions have otherwise, without a model."""
+    rows = [[f"`{edition.name}`", ", ".join(f"`{name}`" for name in edition.beyond)] for edition in editions().values() if edition.beyond]
+    return markdown_table(["edition", "not modelled"], rows)
 
 
 def size_table() -> str:
@@ -240,6 +270,10 @@ def _worst(curve: list[float | None]) -> str:
 TABLES: dict[str, Callable[[], str]] = {
     "hyperparameters": hyperparameter_table,
     "sizes": size_table,
+    "editions": edition_list,
+    "edition_differences": edition_table,
+    "edition_beyond": edition_beyond,
+    **{f"editions of {Path(chapter).stem}": functools.partial(edition_table, chapter) for chapter in chapters_with_editions()},
     "benchmarks": benchmark_table,
     "conformance_summary": conformance_summary,
     "conformance_chapters": conformance_chapters,

@@ -52,7 +52,7 @@ def rms_norm(x, scale, epsilon):
 
 
 def settings(**changes: Any) -> Settings:
-    base = {"candidate": "mine.py", "process": False, "dtype": "float64", "device": None, "profile": "paper", "only": ""}
+    base = {"candidate": "mine.py", "process": False, "dtype": "float64", "device": None, "edition": "paper", "only": ""}
     return Settings(**{**base, "seed": 3, "examples": 5, "at_least": 1, **changes})
 
 

@@ -222,7 +222,7 @@ def test_a_process_and_an_object_have_snippets() -> None:
     asked = settings(candidate="./their server", process=True)
     assert "ProcessAdapter('./their server', 'float64'" in snippet(PASS, Call("symlog", (np.ones(2),)), asked)
     made = snippet("replay.any", Call("Replay", (10, 2)), settings())
-    assert "run_check(CHECKS['replay.any'], adapter, 'float64', 'paper', seed=3, examples=5)" in made
+    assert "judge(CHECKS['replay.any'], adapter, find_edition('paper'), 'float64', seed=3, examples=5)" in made
     assert "adapter.Replay" not in made
     compile(made, "snippet", "exec")
 

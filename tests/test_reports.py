@@ -26,7 +26,8 @@ def data() -> dict[str, Any]:
 def hostile() -> dict[str, Any]:
     """Every text that an implementation or a file can bring in."""
     made = make(reasons={FAIL: HOSTILE})
-    made["candidate"] = made["device"] = made["implementation"]["name"] = made["implementation"]["edition"] = HOSTILE
+    made["candidate"] = made["device"] = made["implementation"]["name"] = made["implementation"]["edition"] = made["edition"] = HOSTILE
+    made["fit"] = {"editions": [{"edition": HOSTILE, "passed": 1, "judged": 2, "offered": 3}], "alike": [HOSTILE], "better": HOSTILE}
     made["verdict"]["problems"] = [HOSTILE]
     made["versions"][HOSTILE] = HOSTILE
     made["diagnoses"][0] |= dict.fromkeys(("mutant", "explanation", "provenance", "chapter", "fix"), HOSTILE)
@@ -163,7 +164,7 @@ def test_the_page_needs_nothing_else(data: dict[str, Any]) -> None:
 
 def test_a_page_of_several(data: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     other = make((PASS, "transforms.symexp_matches"))
-    other["implementation"] = {"name": "other", "version": "", "edition": "official"}
+    other |= {"implementation": {"name": "other", "version": "", "edition": "official"}, "edition": "2024-12", "choice": "claimed"}
     paths = []
     for name, result in (("a", data), ("b", other)):
         paths.append(str(tmp_path / f"{name}.json"))
@@ -172,7 +173,7 @@ def test_a_page_of_several(data: dict[str, Any], tmp_path: Path, capsys: pytest.
     document = Document((tmp_path / "page.html").read_text(encoding="utf-8"))
     assert "Failures of mine 1.2" in document.text
     assert "Failures of other" not in document.text
-    assert "claims the edition official" in document.text
+    assert "Judged as the edition 2024-12 (the authors' code since December 2024), as it claims." in document.text
     assert main(["report", str(tmp_path / "page.html")]) == 2
     assert capsys.readouterr().err.startswith("conformance: error: ")
 

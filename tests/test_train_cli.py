@@ -185,6 +185,16 @@ def test_every_hyperparameter_is_an_option_in_both_spellings() -> None:
     assert parse(["--backend", "jax", "--cnn-multipliers", "1,4"]).config.cnn_multipliers == (1, 4)
 
 
+def test_the_first_version_is_not_for_training(capsys: pytest.CaptureFixture[str]) -> None:
+    assert parse(["--backend", "jax", "--profile", "2024-04"]).config == dataclasses.replace(
+        parse(["--backend", "jax"]).config, beta2=0.999, warmup_steps=1000, continue_target="discounted", vector_loss_scale=1.0
+    )
+    assert main(["--backend", "jax", "--profile", "2023"]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("train: error: the profile 2023 is for `conformance check` only")
+    assert error.count("\n") == 1
+
+
 def test_help_shows_meaning_symbol_and_default(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         main(["--help"])
@@ -194,7 +204,7 @@ def test_help_shows_meaning_symbol_and_default(capsys: pytest.CaptureFixture[str
         assert f"--{name.replace('_', '-')}" in text
         assert entry["help"] in text
     assert "beta_rep (default 0.1)" in text
-    assert "(default 0.99; official: 0.999)" in text
+    assert "(default 0.99; 2024-04: 0.999; official: 0.999)" in text
     assert "DeepMind" in text
 
 

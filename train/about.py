@@ -9,7 +9,7 @@ import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from spec import Config, Spaces, load_config, profiles, sizes
+from spec import Config, Spaces, built_profiles, load_config, sizes
 from train.errors import writing
 from train.files import read_json
 from train.machine import describe
@@ -102,7 +102,7 @@ def nearest(config: Config) -> tuple[str, str, dict[str, Any]]:
         other = dataclasses.asdict(load_config(profile, size))
         return {name: value for name, value in values.items() if value != other[name]}
 
-    candidates = [(profile, size, changed(profile, size)) for profile in profiles() for size in sizes()]
+    candidates = [(profile, size, changed(profile, size)) for profile in built_profiles() for size in sizes()]
     return min(candidates, key=lambda candidate: len(candidate[2]))
 
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from spec import hyperparameters, profiles, sizes
+from spec import built_profiles, hyperparameters, profiles, sizes
 from train.commands import COMMANDS
 from train.errors import UserError
 from train.options import DEFAULT_PRESET, NONFINITE, PROCESSES, RESUME, Options, make_options, presets
@@ -93,7 +93,10 @@ def build_parser() -> argparse.ArgumentParser:
     )
     run.add_argument("--size", choices=list(sizes()), metavar="SIZE", help=f"model size: {', '.join(sizes())} (default {base['size']})")
     run.add_argument(
-        "--profile", choices=list(profiles()), metavar="PROFILE", help=f"{' or '.join(profiles())} (default {base['profile']})"
+        "--profile",
+        choices=list(profiles()),
+        metavar="PROFILE",
+        help=f"{', '.join(built_profiles())} (default {base['profile']}); see docs/editions.md",
     )
     run.add_argument("--steps", type=_whole(1), metavar="N", help=f"environment steps, with action repeat (default {base['steps']:,})")
     run.add_argument("--seed", type=_whole(0), metavar="N", help="seed of everything random (default 0)")
@@ -176,7 +179,7 @@ def _preset_help() -> str:
 
 def _help(name: str, entry: dict[str, Any]) -> str:
     default = "by --size" if any(name in size for size in sizes().values()) else _show(entry["value"])
-    others = "".join(f"; {profile}: {_show(values[name])}" for profile, values in profiles().items() if name in values)
+    others = "".join(f"; {profile}: {_show(profiles()[profile][name])}" for profile in built_profiles() if name in profiles()[profile])
     symbol = f", {entry['symbol']}" if "symbol" in entry else ""
     return f"{entry['help']}{symbol} (default {default}{others})".replace("%", "%%")
 

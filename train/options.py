@@ -9,7 +9,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from spec import Config, load_config
+from spec import Config, built_profiles, load_config
 from train.errors import UserError
 
 DEFAULT_PRESET = "cartpole"
@@ -69,7 +69,7 @@ def make_options(backend: str, given: Mapping[str, Any], hyperparameters: Mappin
     """The options of a run: `given` by name of the fields of Options, plus "profile" and "size"; hyperparameters by their names.
 
     Raises:
-      UserError: an unknown preset, profile, size or hyperparameter, or a value that no run could have.
+      UserError: an unknown preset, profile, size or hyperparameter, a profile that is not for training, or a value that no run could have.
     """
     known = [name for name in presets() if name != "base"]
     if preset is not None and preset not in known:
@@ -79,10 +79,16 @@ def make_options(backend: str, given: Mapping[str, Any], hyperparameters: Mappin
     chosen = presets()[preset] if preset else {}
     settings = {**presets()["base"], **chosen, **given}
     overrides = {**chosen.get("hyperparameters", {}), **hyperparameters}
+    profile = settings.pop("profile")
     try:
-        config = load_config(settings.pop("profile"), settings.pop("size"), **overrides)
+        config = load_config(profile, settings.pop("size"), **overrides)
     except ValueError as error:
         raise UserError(str(error)) from error
+    if profile not in built_profiles():
+        raise UserError(
+            f"the profile {profile} is for `conformance check` only: the networks and optimizers of that edition are not built here; "
+            f"train with one of {', '.join(built_profiles())}"
+        )
     settings = {name: value for name, value in settings.items() if name not in ("help", "hyperparameters")}
     settings.setdefault("logdir", default_logdir(settings["task"], backend, settings.get("seed", 0)))
     return Options(backend=backend, config=config, **settings)

@@ -6,16 +6,19 @@ from pathlib import Path
 
 from rich.console import Console
 
+from conformance.adapter import COLUMNS
 from conformance.candidate import candidate, remarks
 from conformance.check import DTYPES, Check
 from conformance.diagnosis import diagnose
+from conformance.editions import Fit, best, fit, judge, telling_checks, to_json
 from conformance.errors import UserError
-from conformance.execute import Result, Settings, run_check, selected_checks
+from conformance.execute import Result, Settings, selected_checks
 from conformance.expected import ExpectedFailures, read_expected
 from conformance.reports import badge, html, junit, markdown, terminal
-from conformance.results import Data, identity, result_data, write, write_text
-from spec import profiles
+from conformance.results import FAILING, Data, identity, result_data, write, write_text
+from spec import editions, find_edition
 
+COLUMN_EDITION = "paper"  # of our own columns, unless another is given: they follow the configuration, so there is nothing to find out
 RENDERED: dict[str, Callable[[Data], str]] = {
     "markdown": markdown.render,
     "junit": junit.render,
@@ -34,7 +37,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--timeout", type=float, default=120.0, help="seconds that a process has for each reply")
     parser.add_argument("--dtype", choices=DTYPES, default="float64", help="precision of the backend")
     parser.add_argument("--device", default=None, help="device of the backend, as the backend names it: cpu, cuda, gpu, ...")
-    parser.add_argument("--profile", choices=tuple(profiles()), default="paper", help="profile of the configurations")
+    parser.add_argument(
+        "--edition",
+        choices=tuple(editions()),
+        help="judge in this edition (default: the one that is claimed, or else the one that fits best)",
+    )
     parser.add_argument("--only", default="", help="only checks whose name or requirement id contains this")
     parser.add_argument("--seed", type=int, default=0, help="seed of the drawn cases")
     parser.add_argument("--examples", type=int, default=25, help="cases that hypothesis draws for each property")
@@ -55,19 +62,27 @@ def main(console: Console, options: argparse.Namespace) -> int:
     if not checks:
         raise UserError(f"no check matches --only {options.only!r}")
     expected = read_expected(options.expect) if options.expect else ExpectedFailures()
-    settings = Settings(
-        candidate=options.candidate or options.process or "",
-        process=options.process is not None,
-        **{name: getattr(options, name) for name in ("dtype", "device", "profile", "only", "seed", "examples", "at_least")},
-    )
     with candidate(options.candidate, options.process, options.dtype, options.device, options.timeout) as adapter:
         for remark in remarks(adapter):
             console.print(remark, markup=False, highlight=False)
-        implementation = identity(adapter, settings)
+        implementation = identity(adapter, options.candidate or options.process or "")
+        asked = options.edition or (COLUMN_EDITION if options.candidate in COLUMNS else None)
+        named = asked or _claimed(implementation["edition"])
+        fits = [] if named else _fit(console, checks, adapter, options)
+        settings = Settings(
+            candidate=options.candidate or options.process or "",
+            process=options.process is not None,
+            edition=named or best(fits).edition,
+            **{name: getattr(options, name) for name in ("dtype", "device", "only", "seed", "examples", "at_least")},
+        )
         results = list(_run_all(console, checks, adapter, settings))
-        with console.status("comparing failures with known mistakes"):
-            diagnoses = diagnose(adapter, results, settings.dtype, settings.profile, settings.seed, settings.examples)
-        data = result_data(settings, implementation, results, expected, [diagnosis.to_json() for diagnosis in diagnoses])
+        if named and telling_checks(result.check for result in results if result.status in FAILING):
+            fits = _fit(console, checks, adapter, options)
+        diagnoses = _diagnoses(console, adapter, results, settings)
+        choice = "given" if asked else "claimed" if named else "best fit"
+        data = result_data(
+            settings, implementation, results, expected, diagnoses, choice, to_json(fits, settings.edition) if fits else None
+        )
     terminal.show(console, data)
     if options.json:
         write(options.json, data)
@@ -77,8 +92,29 @@ def main(console: Console, options: argparse.Namespace) -> int:
     return 0 if data["verdict"]["passed"] else 1
 
 
+def _claimed(name: str | None) -> str | None:
+    """The edition that an adapter claims, by its name or that of its profile."""
+    try:
+        return None if name is None else find_edition(name).name
+    except ValueError as error:
+        raise UserError(f"the adapter's edition(): {error}") from error
+
+
+def _fit(console: Console, checks: list[Check], adapter: object, options: argparse.Namespace) -> list[Fit]:
+    with console.status("finding the edition that fits best"):
+        return fit(telling_checks(checks), adapter, options.dtype, options.seed)
+
+
 def _run_all(console: Console, checks: list[Check], adapter: object, settings: Settings) -> Iterable[Result]:
+    edition = editions()[settings.edition]
     with console.status("checking") as status:
         for number, check in enumerate(checks, 1):
             status.update(f"{number}/{len(checks)} {check.name}")
-            yield run_check(check, adapter, settings.dtype, settings.profile, settings.seed, settings.examples)
+            yield judge(check, adapter, edition, settings.dtype, settings.seed, settings.examples)
+
+
+def _diagnoses(console: Console, adapter: object, results: list[Result], settings: Settings) -> list[Data]:
+    """The mistakes that explain failures. What the edition has otherwise is none."""
+    with console.status("comparing failures with known mistakes"):
+        found = diagnose(adapter, results, settings.dtype, settings.profile, settings.seed, settings.examples)
+    return [diagnosis.to_json() for diagnosis in found if diagnosis.mutant.name not in editions()[settings.edition].mutants]

@@ -19,7 +19,7 @@ from conformance.lockstep.plot import draw, figure_class
 from conformance.lockstep.report import failures, report
 from conformance.lockstep.run import MODES, PROBLEMS, Comparison, Lockstep
 from conformance.results import versions, write
-from spec import profiles
+from spec import built_profiles
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--steps", type=int, default=1000, help="train steps")
     parser.add_argument("--problems", default=",".join(PROBLEMS), help="vector has discrete actions, image continuous ones")
     parser.add_argument("--dtype", choices=DTYPES, default="float64", help="precision of the backends; float64 has a bound")
-    parser.add_argument("--profile", choices=tuple(profiles()), default="paper", help="profile of the configuration")
+    parser.add_argument("--profile", choices=built_profiles(), default="paper", help="profile of the configuration")
     parser.add_argument("--seed", type=int, default=0, help="seed of parameters, data and noise")
     parser.add_argument("--out", type=Path, default=None, metavar="FOLDER", help="write numbers and pictures to this folder, too")
 

@@ -6,13 +6,13 @@ from pathlib import Path
 from rich.console import Console
 
 from conformance.vectors.writing import SETS, write_vectors
-from spec import profiles
+from spec import built_profiles
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="where to write them; an older set there is replaced")
     parser.add_argument("--set", choices=tuple(SETS), default="minimal", help="how much: under 1 MB, or all that the checks draw")
-    parser.add_argument("--profile", choices=tuple(profiles()), default="paper", help="profile of the configurations")
+    parser.add_argument("--profile", choices=built_profiles(), default="paper", help="profile of the configurations")
     parser.add_argument("--seed", type=int, default=0, help="seed of the drawn cases")
     parser.add_argument("--only", default="", help="only checks whose name or requirement id contains this")
 

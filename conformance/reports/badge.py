@@ -30,7 +30,7 @@ def render(data: Data) -> str:
 
 def outcome(data: Data) -> tuple[str, str]:
     """The words on the right, and their colour. Yellow: failures that are expected, and no other."""
-    counts, offered = summary.counts(data), summary.offered(data)
+    counts, offered = summary.counts(data), summary.judged(data)
     if not offered:
         return "nothing offered", GREY
     if not data["verdict"]["passed"]:

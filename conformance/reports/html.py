@@ -10,7 +10,10 @@ from conformance.reports.style import STYLE
 from conformance.reports.summary import Data
 
 POLICY = "default-src 'none'; style-src 'unsafe-inline'"
-KIND = {"pass": "pass", "fail": "fail", "error": "fail", "expected failure": "known", "partly offered": "pass", "not offered": "none"}
+KIND = {
+    **{"pass": "pass", "fail": "fail", "error": "fail", "expected failure": "known", "partly offered": "pass"},
+    **{"not offered": "none", "not in edition": "none"},
+}
 OPEN = 3  # so many failures of a result are open from the start
 
 
@@ -56,19 +59,18 @@ def prose(text: str) -> str:
 
 def _card(data: Data) -> str:
     passed, counts = data["verdict"]["passed"], summary.counts(data)
-    edition = data["implementation"]["edition"]
     failing = counts["fail"] + counts["error"]
     others = [f"{failing} fail"] if failing else []
-    others += [f"{counts[name]} {name}" for name in ("expected failure", "not offered") if counts[name]]
+    others += [f"{counts[name]} {name}" for name in ("expected failure", "not offered", "not in edition") if counts[name]]
     problems = "".join(f"<li>{escape(problem)}</li>" for problem in data["verdict"]["problems"])
     versions = ", ".join(f"{name} {version}" for name, version in data["versions"].items())
     lines = [
-        f'<p>{escape(summary.label(data))} <span class="muted">{escape(data["dtype"])}, {escape(data["profile"])}</span></p>',
-        f"<b>{counts['pass']} <small>of {summary.offered(data)} offered checks pass</small></b>",
+        f'<p>{escape(summary.label(data))} <span class="muted">{escape(data["dtype"])}, {escape(data["edition"])}</span></p>',
+        f"<b>{counts['pass']} <small>of {summary.judged(data)} offered checks pass</small></b>",
         f'<p class="{"good" if passed else "bad"}">{"Conforms in what it offers" if passed else "Does not conform"}</p>',
         f'<ul class="small">{problems}</ul>' if problems else "",
         f'<p class="small">{escape(", ".join(others))}</p>',
-        f'<p class="small">claims the edition {escape(edition)}</p>' if edition else "",
+        *(f'<p class="small">{escape(line)}</p>' for line in summary.edition(data)),
         f'<p class="small muted">{escape(summary.settings(data))}; {escape(data["date"])}</p>',
         f'<p class="small muted">{escape(versions)}</p>',
     ]
@@ -80,7 +82,7 @@ def _heads(results: Sequence[Data]) -> str:
     labels = [summary.label(data) for data in results]
     twice = Counter(labels)
     heads = (
-        f"{label} {data['dtype']}, {data['profile']}" if twice[label] > 1 else label for label, data in zip(labels, results, strict=True)
+        f"{label} {data['dtype']}, {data['edition']}" if twice[label] > 1 else label for label, data in zip(labels, results, strict=True)
     )
     return "".join(f"<th class=cell>{escape(head)}</th>" for head in heads)
 
@@ -132,7 +134,7 @@ def _chapter_cell(chapter: summary.Chapter | None) -> str:
         return _cell("fail", f"{failing} of {total} fail")
     if counts["expected failure"]:
         return _cell("known", f"{counts['expected failure']} of {total} as expected")
-    return _cell("pass", f"{passing} of {total} pass", chapter.share) if passing else _cell("none", "not offered")
+    return _cell("pass", f"{passing} of {total} pass", chapter.share) if passing else _cell("none", "not judged")
 
 
 def _requirements(results: Sequence[Data], names: Sequence[str]) -> str:

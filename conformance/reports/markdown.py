@@ -12,7 +12,7 @@ def render(data: Data) -> str:
         f"# Conformance of {text(summary.label(data))}",
         f"**{text(summary.headline(data)).capitalize()}.**",
         f"{text(summary.settings(data))}, {text(data['date'])}. {text(summary.tally(data))}.",
-        *_claim(data),
+        text(" ".join(summary.edition(data))),
         _chapters(data),
         *_diagnoses(data),
         *_expected(data),
@@ -52,11 +52,6 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 def chapter(path: str) -> str:
     address = summary.address(path)
     return f"[{text(summary.title(path))}]({address})" if address else f"{text(summary.title(path))} ({code(path)})"
-
-
-def _claim(data: Data) -> list[str]:
-    edition = data["implementation"]["edition"]
-    return [f"It claims the edition {text(edition)}."] if edition else []
 
 
 def _chapters(data: Data) -> str:

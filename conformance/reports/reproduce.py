@@ -28,7 +28,7 @@ def failure(result: Result, settings: Settings) -> dict[str, Any]:
 def command(name: str, settings: Settings) -> str:
     """The command line that runs this check alone, on the same cases."""
     words = ["conformance", "check", *(["--process"] if settings.process else []), settings.candidate]
-    words += ["--dtype", settings.dtype, *(["--device", settings.device] if settings.device else []), "--profile", settings.profile]
+    words += ["--dtype", settings.dtype, *(["--device", settings.device] if settings.device else []), "--edition", settings.edition]
     return shlex.join([*words, "--only", name, "--seed", str(settings.seed), "--examples", str(settings.examples)])
 
 
@@ -47,15 +47,16 @@ def snippet(name: str, call: Call | None, settings: Settings) -> str:
         lines = ["import numpy as np", "", adapter[0], *([f"from spec import {', '.join(spec)}"] if spec else []), "", adapter[1]]
         lines += [f"{name} = {text}" for name, text in arguments]
         return "\n".join([*lines, f"print(adapter.{call.function}({', '.join(names)}))"])
-    options = f"{settings.dtype!r}, {settings.profile!r}, seed={settings.seed}, examples={settings.examples}"
+    options = f"find_edition({settings.edition!r}), {settings.dtype!r}, seed={settings.seed}, examples={settings.examples}"
     lines = [
         "import conformance.cases",
         adapter[0],
         "from conformance.check import CHECKS",
-        "from conformance.execute import run_check",
+        "from conformance.editions import judge",
+        "from spec import find_edition",
         "",
     ]
-    lines += [adapter[1], f"result = run_check(CHECKS[{name!r}], adapter, {options})", "print(result.message)"]
+    lines += [adapter[1], f"result = judge(CHECKS[{name!r}], adapter, {options})", "print(result.message)"]
     if call is not None and call.function not in OBJECTS:
         lines += [f"print(adapter.{call.function}(*result.call.arguments))"]
         lines += ["print(result.call.expected)"] if call.expected is not None else []

@@ -8,10 +8,12 @@ from collections.abc import Iterator, Mapping
 from importlib import resources
 from typing import Any
 
+from spec import editions
+
 Data = Mapping[str, Any]
 
 FAILING = ("fail", "error")
-STATUSES = ("pass", "fail", "error", "expected failure", "partly offered", "not offered")
+STATUSES = ("pass", "fail", "error", "expected failure", "partly offered", "not offered", "not in edition")
 """Of a requirement, as told: a failure may be expected, and some of its checks may be offered and others not."""
 
 
@@ -82,8 +84,28 @@ def failures(data: Data) -> Iterator[tuple[str, Data]]:
     yield from sorted(failing, key=lambda item: is_expected(item[1]))
 
 
-def offered(data: Data) -> int:
-    return sum(check["status"] != "not offered" for check in data["checks"].values())
+def judged(data: Data) -> int:
+    """How many checks were offered, and say something in the edition."""
+    return sum(check["status"] not in ("not offered", "not in edition") for check in data["checks"].values())
+
+
+def edition(data: Data) -> list[str]:
+    """What the candidate was judged as and why, and which editions fit how well: sentences."""
+    found = editions().get(data["edition"])
+    title = f" ({found.title})" if found else ""
+    reason = {"given": "as asked", "claimed": "as it claims", "best fit": "which fits best"}[data["choice"]]
+    if data["choice"] == "given" and (claimed := data["implementation"]["edition"]) not in (None, data["edition"]):
+        reason += f"; it claims {claimed}"
+    lines = [f"Judged as the edition {data['edition']}{title}, {reason}."]
+    if (fit := data["fit"]) is None:
+        return lines
+    counts = (f"{entry['edition']} {entry['passed']} of {entry['judged']}" for entry in fit["editions"])
+    lines.append(f"Of the checks that tell editions apart pass: {', '.join(counts)}.")
+    if fit["better"]:
+        lines.append(f"The edition {fit['better']} fits better.")
+    if fit["alike"]:
+        lines.append(f"Nothing that is offered tells {data['edition']} from {' or '.join(fit['alike'])}.")
+    return lines
 
 
 def label(data: Data) -> str:
@@ -94,14 +116,14 @@ def label(data: Data) -> str:
 def settings(data: Data) -> str:
     """What the cases were drawn with, and by which kit: enough to draw them again."""
     kit = data["versions"].get("dreamer-spec")
-    parts = [data["dtype"], f"on {data['device']}" if data["device"] else "", f"profile {data['profile']}"]
+    parts = [data["dtype"], f"on {data['device']}" if data["device"] else "", f"edition {data['edition']}"]
     parts += [f"seed {data['seed']}", f"{data['examples']} examples", f"only {data['only']!r}" if data["only"] else ""]
     return ", ".join(filter(None, [*parts, f"dreamer-spec {kit}" if kit else "dreamer-spec, not installed"]))
 
 
 def headline(data: Data) -> str:
     """The outcome in a line."""
-    number, total = offered(data), len(data["checks"])
+    number, total = judged(data), len(data["checks"])
     if data["verdict"]["passed"]:
         return f"passed: conforms in what it offers, {number} of {total} checks"
     return f"failed: {'; '.join(data['verdict']['problems'])}"

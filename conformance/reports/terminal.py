@@ -10,7 +10,7 @@ from rich.table import Table
 from conformance.reports import summary
 from conformance.reports.summary import Data
 
-STYLE = {"pass": "green", "fail": "bold red", "error": "bold red", "expected failure": "yellow", "partly offered": "", "not offered": ""}
+STYLE = {"pass": "green", "fail": "bold red", "error": "bold red", "expected failure": "yellow"}
 SHOWN = 5  # failures in full; the others by name
 LINES = 10  # of one message: the last of a traceback say what happened
 
@@ -24,12 +24,14 @@ def show(console: Console, data: Data) -> None:
         table.add_column(column, overflow="fold")
     for chapter in summary.chapters(data):
         if chapter.counts["not offered"] != len(chapter.requirements):
-            found = [f"[{STYLE[name] or 'default'}]{chapter.counts[name]} {name}[/]" for name in summary.STATUSES if chapter.counts[name]]
+            found = [f"[{STYLE.get(name, 'default')}]{chapter.counts[name]} {name}[/]" for name in summary.STATUSES if chapter.counts[name]]
             table.add_row(chapter.title, ", ".join(found), summary.percent(chapter.share), escape(chapter.where))
     if table.row_count:
         console.print(table)
     else:
         console.print(title, markup=False, highlight=False)
+    for line in summary.edition(data):
+        console.print(line, markup=False, highlight=False)
     for diagnosis in data["diagnoses"]:
         console.print(f"\n[bold]behaves like {escape(diagnosis['mutant'])}[/]: {escape(diagnosis['explanation'])}", highlight=False)
         console.print(f"  see {diagnosis['chapter']}. {diagnosis['fix']}", markup=False, highlight=False)
@@ -48,7 +50,7 @@ def show(console: Console, data: Data) -> None:
         outcome = {"fail": "fails as expected", "pass": "passes, and is expected to fail", "not run": "was not run"}[entry["outcome"]]
         console.print(f"{entry['name']} {outcome}: {entry['reason']}", markup=False, highlight=False)
     console.print(summary.tally(data), markup=False, highlight=False)
-    if not summary.offered(data):
+    if not summary.judged(data):
         console.print("nothing was checked: the functions that these checks need are not offered", markup=False, highlight=False)
     console.print(f"[{'bold green' if data['verdict']['passed'] else 'bold red'}]{escape(summary.headline(data))}[/]", highlight=False)
 

@@ -1,0 +1,237 @@
+"""How a candidate is judged in an edition, and which edition fits it best.
+
+The checks say what holds in the chapters. Where an edition differs, a mutant of the reference may behave as the edition does; the
+reference with all mutants of an edition is the edition's own reference. A check that it passes holds in the edition, too, and runs as
+always. A check that it does not pass gives the calls: what the candidate returns is compared with what the edition's reference returns. And
+where the edition's way is not modelled, nothing is judged.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+from conformance.adapter import OBJECTS
+from conformance.adapters.numpy_adapter import NumpyAdapter
+from conformance.check import CHECKS, Check, Run, Worst
+from conformance.diagnosis import AGREEMENT, DERIVATIVES, VALUES
+from conformance.execute import Result, finish, missing, not_offered, run_check
+from conformance.mutants import MUTANTS, Mutant, MutantAdapter
+from conformance.mutants.trial import on_the_mutant, on_the_reference
+from spec import Edition, editions
+
+NOT_JUDGED = "not in edition"
+REACH_EXAMPLES = 5  # cases that show which functions a check reaches
+FIT_EXAMPLES = 5
+GRADIENTS = {"gradients", "gradients_given", "loss_derivatives"}
+PREFERRED = ("paper", "2024-12", "2024-04", "2023")
+"""The order of editions that fit equally well."""
+
+
+@functools.cache
+def own_reference(edition: str) -> Mutant | None:
+    """The mutants of an edition as one; None where the reference itself is the edition's.
+
+    Raises:
+      ValueError: two of them change the same words.
+    """
+    edits: dict[str, dict[str, str]] = {}
+    for name in editions()[edition].mutants:
+        for target, changes in MUTANTS[name].edits.items():
+            if clash := changes.keys() & edits.setdefault(target, {}).keys():
+                raise ValueError(f"edition {edition}: two mutants change {sorted(clash)} of {target}")
+            edits[target] |= changes
+    if not edits:
+        return None
+    differs = tuple(requirement for requirement, difference in editions()[edition].differs.items() if difference.like)
+    return Mutant(f"edition {edition}", editions()[edition].title, editions()[edition].source, differs, "", edits)
+
+
+def telling_checks(checks: Iterable[Check]) -> list[Check]:
+    """Those by which editions can be told apart: of a requirement that an edition has otherwise, by a mutant or by a setting.
+
+    Gradients are left out: they are slow, and tell nothing that the losses do not.
+    """
+    told = {name for edition in editions().values() for name, difference in edition.differs.items() if difference.is_modelled}
+    return [check for check in checks if not told.isdisjoint(check.requirements) and GRADIENTS.isdisjoint(check.uses)]
+
+
+def judge(check: Check, adapter: object, edition: Edition, dtype: str, seed: int = 0, examples: int = 25, shrink: bool = True) -> Result:
+    """Runs one check as the edition has it; with the status "not in edition" where that is not known."""
+    if lacking := missing(adapter, check):
+        return not_offered(check, lacking)
+    if reason := _unknown(check, edition.name, dtype, seed, examples):
+        return Result(check, NOT_JUDGED, Worst(), 0, reason)
+    if _holds(check, edition.name, dtype, seed, examples):
+        return run_check(check, adapter, dtype, edition.profile, seed, examples, shrink)
+    return finish(check, _ComparedRun(adapter, edition, dtype, seed, examples, shrink))
+
+
+@functools.cache
+def _unknown(check: Check, name: str, dtype: str, seed: int, examples: int) -> str:
+    """Why a check cannot be judged in an edition; "" if it can."""
+    edition = editions()[name]
+    if others := [identifier for identifier in check.requirements if _is_unknown(edition, identifier)]:
+        return f"{name} has {', '.join(others)} otherwise, which is not modelled here"
+    if own_reference(name) is None and edition.is_built:
+        return ""
+    if reached := sorted(_reach(check, name, dtype, seed) & set(edition.beyond)):
+        return f"it reaches {', '.join(reached)}, which {name} has otherwise and which is not modelled here"
+    if _holds(check, name, dtype, seed, examples):
+        return ""
+    if missing(NumpyAdapter(), check) or any(use in OBJECTS or use.startswith("draw_") for use in check.uses):
+        return f"{name} has some of it otherwise, and there are no right results to compare with"
+    return ""
+
+
+def _is_unknown(edition: Edition, requirement: str) -> bool:
+    return requirement in edition.differs and not edition.differs[requirement].is_modelled
+
+
+@functools.cache
+def _holds(check: Check, name: str, dtype: str, seed: int, examples: int) -> bool:
+    """Whether the edition's own reference passes a check that is run as always."""
+    mutant = own_reference(name)
+    if mutant is None or _reach(check, name, dtype, seed).isdisjoint(mutant.edits):
+        return True
+    check, dtype = _stand_in(check, dtype)
+    return on_the_mutant(mutant, check, dtype, editions()[name].profile, seed, examples).status == "pass"
+
+
+def _reach(check: Check, name: str, dtype: str, seed: int) -> frozenset[str]:
+    check, dtype = _stand_in(check, dtype)
+    return on_the_reference(check, dtype, editions()[name].profile, seed, REACH_EXAMPLES)[1]
+
+
+def _stand_in(check: Check, dtype: str) -> tuple[Check, str]:
+    """What can be asked of the reference: for gradients and train steps, which it lacks, the losses that these are made of."""
+    if not missing(NumpyAdapter(), check):
+        return check, dtype
+    return CHECKS[VALUES], dtype if dtype in CHECKS[VALUES].dtypes else "float64"
+
+
+class _ComparedRun(Run):
+    """A check of whose calls every one is compared with the edition's reference. What the check itself expects does not count."""
+
+    def __init__(self, adapter: object, edition: Edition, dtype: str, seed: int, examples: int, shrink: bool) -> None:
+        super().__init__(adapter, dtype, edition.profile, seed, examples, shrink)
+        mutant = own_reference(edition.name)
+        assert mutant is not None
+        self._right = MutantAdapter(mutant)
+        self._counts = False
+
+    def call(self, function: str, *args: Any) -> Any:
+        if self._counts:
+            return super().call(function, *args)
+        bound = (DERIVATIVES if function == "loss_derivatives" else AGREEMENT)[self.dtype]
+        return self._compared(function, args, {"magnitude": "tensor", "bound": bound})
+
+    def expect(self, function: str, args: tuple[Any, ...], expected: Any, **how: Any) -> Any:
+        return self._compared(function, args, how)
+
+    def refuses(self, function: str, *args: Any, naming: Iterable[str] = ()) -> None:
+        try:
+            getattr(self._right, function)(*args)
+        except ValueError:
+            with self._counting():
+                super().refuses(function, *args, naming=naming)
+        else:
+            self.call(function, *args)
+
+    def compare(self, where: str, actual: Any, expected: Any, **how: Any) -> None:
+        if self._counts:
+            super().compare(where, actual, expected, **how)
+
+    def exact(self, where: str, actual: Any, expected: Any) -> None:
+        if self._counts:
+            super().exact(where, actual, expected)
+
+    def holds(self, where: str, condition: Any) -> None:
+        if self._counts:
+            super().holds(where, condition)
+
+    def _compared(self, function: str, args: tuple[Any, ...], how: Mapping[str, Any]) -> Any:
+        expected = getattr(self._right, function)(*args)
+        with self._counting():
+            actual = self.call(function, *args)
+            self.compare(function, actual, expected, **how)
+        return actual
+
+    @contextmanager
+    def _counting(self) -> Iterator[None]:
+        self._counts = True
+        try:
+            yield
+        finally:
+            self._counts = False
+
+
+@dataclasses.dataclass(frozen=True)
+class Fit:
+    """What the telling checks found in one edition. statuses: check name -> status, of the checks that are offered."""
+
+    edition: str
+    statuses: Mapping[str, str]
+
+    @property
+    def judged(self) -> frozenset[str]:
+        return frozenset(name for name, status in self.statuses.items() if status != NOT_JUDGED)
+
+    @property
+    def passed(self) -> frozenset[str]:
+        return frozenset(name for name, status in self.statuses.items() if status == "pass")
+
+
+def fit(checks: Iterable[Check], adapter: object, dtype: str, seed: int = 0, examples: int = FIT_EXAMPLES) -> list[Fit]:
+    """How the candidate does in each edition, those that are preferred first.
+
+    A candidate that raises in one edition is not asked again in the others: it would tell nothing, and may be slow to come back.
+    """
+    found: dict[str, dict[str, str]] = {name: {} for name in PREFERRED}
+    for check in checks:
+        if missing(adapter, check):
+            continue
+        broken = False
+        for name, statuses in found.items():
+            known = _unknown(check, name, dtype, seed, examples)
+            status = NOT_JUDGED if known else "error" if broken else ""
+            statuses[check.name] = status or judge(check, adapter, editions()[name], dtype, seed, examples, shrink=False).status
+            broken |= statuses[check.name] == "error"
+    return [Fit(name, statuses) for name, statuses in found.items()]
+
+
+def best(fits: Iterable[Fit]) -> Fit:
+    """The edition that the fewest others fit better; of several, the first.
+
+    Two editions are compared on the checks that are judged in both. So an edition does not win by what is not judged in it.
+    """
+    fits = list(fits)
+    return min(fits, key=lambda one: sum(fits_better(other, one) for other in fits))
+
+
+def fits_better(one: Fit, other: Fit) -> bool:
+    common = one.judged & other.judged
+    return len(one.passed & common) > len(other.passed & common)
+
+
+def alike(fits: Iterable[Fit], chosen: Fit) -> list[str]:
+    """The other editions that nothing which is offered tells from the chosen one."""
+    return [
+        one.edition
+        for one in fits
+        if one is not chosen and all(one.statuses[name] == chosen.statuses[name] for name in one.judged & chosen.judged)
+    ]
+
+
+def to_json(fits: list[Fit], edition: str) -> dict[str, Any]:
+    """What the reports say of the fits of a candidate that was judged in an edition: the schema's `fit`."""
+    chosen = next(one for one in fits if one.edition == edition)
+    better = best(fits)
+    return {
+        "editions": [
+            {"edition": one.edition, "passed": len(one.passed), "judged": len(one.judged), "offered": len(one.statuses)} for one in fits
+        ],
+        "alike": alike(fits, chosen),
+        "better": better.edition if fits_better(better, chosen) else None,
+    }
