@@ -1,13 +1,12 @@
 """sheeprl 0.8: its DreamerV3 after the Nature paper, `sheeprl.algos.dreamer_v3_5`.
 
-Their code is time first, keeps latents flat, puts the latents before the memory in a state, images and kernels channels first, and computes
-losses in float32. What they write inside of a longer function is reached by calling that function with stand-ins for the networks:
-`world_model_loss` for the KL losses, `imagine` for the weights, `actor_critic_loss` for the losses of actor and critic, one element at a time.
-Their spaces have either real or discrete actions, and no discrete observations: here each action key has an actor of its own, and a
-discrete observation enters as the one-hot that an environment wrapper would make.
+Their code is time first, keeps latents flat, and computes losses in float32. What they write inside of a longer function is reached by
+calling that function with stand-ins for the networks, one element at a time: `world_model_loss` for the KL losses, `imagine` for the
+weights, and `actor_critic_loss` for the losses of actor and critic. Their policies have either real or discrete actions; where an agent
+has both, each action key gets a policy of its own here, and log-probabilities and entropies are added up as theirs are.
 
-Not offered: samples from given noise (they draw with the generator of PyTorch), and whole training steps (their step takes a batch, a
-configuration of Hydra and a Fabric).
+Not offered: samples from given noise, since they draw with the generator of PyTorch; encoder and decoder, whose checks also ask for strided
+convolutions; whole training steps, which take a configuration of Hydra and a Fabric.
 """
 
 from importlib.metadata import version
@@ -115,10 +114,6 @@ def out_of(params, name):
     return [params[f"{name}/kernel"].mT, params[f"{name}/bias"]]
 
 
-def conv_of(params, name, *more):
-    return [params[f"{name}/kernel"].permute(3, 2, 0, 1), *(params[f"{name}/{entry}"] for entry in ("bias", *more))]
-
-
 def linear(x, kernel, bias):
     return fill(agent.Linear(*kernel.shape), (kernel.mT, bias))(x)
 
@@ -133,19 +128,16 @@ def rms_norm(x, scale, epsilon):
 
 
 def max_pool(x):
-    return agent.MaxPool()(x.flatten(0, -4).permute(0, 3, 1, 2)).permute(0, 2, 3, 1).unflatten(0, x.shape[:-3])
+    return of_images(agent.MaxPool(), x)
 
 
 def upsample(x):
-    return agent.Upsample()(x.flatten(0, -4).permute(0, 3, 1, 2)).permute(0, 2, 3, 1).unflatten(0, x.shape[:-3])
+    return of_images(agent.Upsample(), x)
 
 
-def dense(params, name, x, epsilon):
-    return fill(agent.mlp(*params[f"{name}/kernel"].shape, 1, eps=epsilon), dense_of(params, name))(x)
-
-
-def mlp(params, name, x, layers, epsilon):
-    return fill(agent.mlp(*params[f"{name}/hidden0/kernel"].shape, layers, eps=epsilon), mlp_of(params, name, layers))(x)
+def of_images(module, x):
+    y = module(x.reshape(-1, *x.shape[-3:]).permute(0, 3, 1, 2)).permute(0, 2, 3, 1)
+    return y.reshape(*x.shape[:-3], *y.shape[1:])
 
 
 # rssm
@@ -207,82 +199,8 @@ def imagine_given(params, carry, action, stoch, config):
 # networks
 
 
-def kinds(spaces):
-    """The keys of the vectors and of the images."""
-    images = [key for key, space in spaces.observations.items() if hasattr(space, "channels")]
-    return [key for key in spaces.observations if key not in images], images
-
-
 def width(space):
     return sum(space.classes) if hasattr(space, "classes") else space.size
-
-
-def encoder(params, observations, spaces, config):
-    vectors, images = kinds(spaces)
-    tokens = []
-    if vectors:
-        values, space_of = {}, spaces.observations
-        for key in vectors:
-            values[key] = (
-                one_hots(observations[key], space_of[key]) if hasattr(space_of[key], "classes") else symlog(observations[key].float())
-            )
-        sizes = [width(space_of[key]) for key in vectors]
-        network = agent.MLPEncoder(vectors, sizes, config.encoder_layers, config.units, eps=config.norm_epsilon, symlog_inputs=False)
-        tokens.append(fill(network, mlp_of(params, "encoder/vector", config.encoder_layers))(values))
-    if images:
-        network = agent.CNNEncoder(images, *image_shape(spaces, images), config.cnn_depth, config.cnn_multipliers, eps=config.norm_epsilon)
-        stages = range(len(config.cnn_multipliers))
-        fill(network, [x for i in stages for x in conv_of(params, f"encoder/image/conv{i}", "scale")])
-        features = network({key: observations[key].movedim(-1, -3).float() / 255.0 - 0.5 for key in images})
-        tokens.append(features.unflatten(-1, bottleneck(network.input_dim, config)).movedim(-3, -1).flatten(-3))
-    return torch.cat(tokens, -1)
-
-
-def one_hots(values, space):
-    parts = [nn.functional.one_hot(values[..., i].long(), classes) for i, classes in enumerate(space.classes)]
-    return torch.cat(parts, -1).float()
-
-
-def image_shape(spaces, images):
-    first = spaces.observations[images[0]]
-    return [spaces.observations[key].channels for key in images], (first.height, first.width)
-
-
-def bottleneck(image, config):
-    halved = 2 ** len(config.cnn_multipliers)
-    return config.cnn_multipliers[-1] * config.cnn_depth, image[-2] // halved, image[-1] // halved
-
-
-def decoder(params, feature, spaces, config):
-    vectors, images = kinds(spaces)
-    state = torch.cat([feature[..., config.deter :], feature[..., : config.deter]], -1)
-    outputs = {}
-    if vectors:
-        sizes = [width(spaces.observations[key]) for key in vectors]
-        network = agent.MLPDecoder(vectors, sizes, feature.shape[-1], config.decoder_layers, config.units, eps=config.norm_epsilon)
-        heads = [x for key in vectors for x in out_of(params, f"decoder/vector/out/{key}")]
-        fill(network, mlp_of(params, "decoder/vector", config.decoder_layers) + heads)
-        outputs |= network(feature)
-    if images:
-        flat = config.stoch * config.classes
-        channels, size = image_shape(spaces, images)
-        network = agent.CNNDecoder(
-            images, channels, config.cnn_depth, flat, config.deter, size, config.cnn_multipliers,
-            block_space=config.blocks, dense_units=config.units, eps=config.norm_epsilon,
-        )  # fmt: skip
-        depth, height, length = bottleneck(size, config)
-        blocks, part = config.blocks, (height, length, depth // config.blocks)
-        kernel = params["decoder/image/deter/kernel"].unflatten(-1, part).movedim(-1, -3).flatten(-3)
-        bias = params["decoder/image/deter/bias"].reshape(blocks, *part).movedim(-1, -3).flatten()
-        whole = (height, length, depth)
-        out_kernel = params["decoder/image/stoch/kernel"].unflatten(-1, whole).movedim(-1, -3).flatten(-3).mT
-        out_bias = params["decoder/image/stoch/bias"].reshape(whole).movedim(-1, -3).flatten()
-        stem = [kernel, bias, *dense_of(params, "decoder/image/stoch_hidden"), out_kernel, out_bias, params["decoder/image/stem/scale"]]
-        stages = range(len(config.cnn_multipliers) - 1)
-        convolutions = [x for i in stages for x in conv_of(params, f"decoder/image/conv{i}", "scale")]
-        fill(network, stem + convolutions + conv_of(params, "decoder/image/out"))
-        outputs |= {key: image.movedim(-3, -1) for key, image in network(state).items()}
-    return outputs
 
 
 def head(params, name, feature, layers, outputs, config):
