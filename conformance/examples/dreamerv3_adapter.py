@@ -23,6 +23,11 @@ __version__ = version("dreamerv3")
 convert = jnp.asarray
 
 
+def network(**attributes):
+    """Stands in for one of their modules, which have a path."""
+    return Namespace(_path="network", **attributes)
+
+
 def edition():
     return "2023"
 
@@ -45,7 +50,7 @@ def symexp_twohot_mean(logits, bins):
 
 def rssm_of(stoch, classes, unimix):
     """Their RSSM with one categorical network, which hands its input through."""
-    rssm = Namespace(_stoch=stoch, _classes=classes, _unimix=unimix, get=lambda *network: lambda x: x)
+    rssm = network(_stoch=stoch, _classes=classes, _unimix=unimix, get=lambda *names: lambda x: x)
     rssm.get_dist = partial(nets.RSSM.get_dist, rssm)
     return rssm
 
@@ -66,18 +71,6 @@ def kl_losses(posterior_logits, prior_logits, config):
     return tuple(method(rssm, posterior, prior, free=config.free_nats) for method in (nets.RSSM.dyn_loss, nets.RSSM.rep_loss))
 
 
-def categorical_kl(log_probs_p, log_probs_q):
-    return jaxutils.OneHotDist(log_probs_p).kl_divergence(jaxutils.OneHotDist(log_probs_q))
-
-
-def categorical_entropy(log_probs):
-    return jaxutils.OneHotDist(log_probs).entropy()
-
-
-def categorical_log_prob(log_probs, onehot):
-    return jaxutils.OneHotDist(log_probs).log_prob(onehot)
-
-
 def draw_categorical(logits, unimix, seed, n):
     rssm, stats = latents(logits, unimix)
     return rssm.get_dist(stats).sample(n, seed=jax.random.PRNGKey(seed))
@@ -86,9 +79,9 @@ def draw_categorical(logits, unimix, seed, n):
 def head(kind, outputs, shape, **options):
     """The distribution that one of their heads makes of the outputs of its last layers: {"out": ...} and perhaps {"std": ...}."""
     options = {"_minstd": 1.0, "_maxstd": 1.0, "_unimix": 0.0, **options}
-    network = Namespace(_dist=kind, _shape=shape, _outscale=1.0, _outnorm=False, _bins=255, **options)
-    network.get = lambda name, *size, **initial: lambda inputs: outputs[name]
-    return nets.Dist.inner(network, outputs["out"])
+    one = network(_dist=kind, _shape=shape, _outscale=1.0, _outnorm=False, _bins=255, **options)
+    one.get = lambda name, *size, **initial: lambda inputs: outputs[name]
+    return nets.Dist.inner(one, outputs["out"])
 
 
 def bernoulli_loss(logit, target):
@@ -122,7 +115,7 @@ def policies(outputs, spaces, config):
             yield head("normal", {"out": raw["mean"], "std": raw["std"]}, (space.size,), **bounds), space.size
         else:
             ends = [sum(space.classes[: i + 1]) for i in range(len(space.classes))]
-            for end, classes in zip(ends, space.classes):
+            for end, classes in zip(ends, space.classes, strict=True):
                 logits = raw["logits"][..., end - classes : end]
                 yield head("onehot", {"out": logits}, (classes,), _unimix=config.actor_unimix), classes
 
@@ -142,7 +135,7 @@ def action_entropy(outputs, spaces, config):
 def draw_actions(outputs, spaces, config, seed, n):
     every = list(policies(outputs, spaces, config))
     keys = jax.random.split(jax.random.PRNGKey(seed), len(every))
-    return jnp.concatenate([policy.sample(n, seed=key) for (policy, _), key in zip(every, keys)], -1)
+    return jnp.concatenate([policy.sample(n, seed=key) for (policy, _), key in zip(every, keys, strict=True)], -1)
 
 
 def horizon_of(discount):
@@ -151,7 +144,7 @@ def horizon_of(discount):
 
 
 def lambda_return(reward, continue_, value, discount, lambda_):
-    critic = Namespace(
+    critic = network(
         rewfn=lambda trajectory: reward.T[1:],
         net=lambda trajectory: Namespace(mean=lambda: value.T),
         config=Namespace(horizon=horizon_of(discount), return_lambda=lambda_),
@@ -163,9 +156,9 @@ def cumulative_weights(continue_, discount):
     rows, steps = continue_.shape
     logits = jax.scipy.special.logit(continue_.T)
     state = {"deter": jnp.zeros((rows, 1))}
-    model = Namespace(
+    model = network(
         rssm=Namespace(initial=lambda size: state, img_step=lambda state, action: {"deter": state["deter"]}),
-        heads={"cont": lambda trajectory: head("binary", {"out": logits}, ())},
+        heads={"cont": lambda trajectory: head("binary", {"out": logits[..., None]}, ())},
         config=Namespace(horizon=horizon_of(discount), imag_unroll=True),
     )
     start = {**state, "is_terminal": 1 - continue_[:, 0]}
@@ -198,14 +191,14 @@ def return_scale(low, high, limit):
 
 
 def actor_loss(log_prob, entropy, returns, value, weight, scale, config):
-    rows = zip(*(x.reshape(-1, 1, 1) for x in (log_prob, entropy, returns, value, weight)))
+    rows = zip(*(x.reshape(-1, 1, 1) for x in (log_prob, entropy, returns, value, weight)), strict=True)
     return jnp.stack([one_actor_loss(*row, scale, config) for row in rows]).reshape(returns.shape)
 
 
 def one_actor_loss(log_prob, entropy, returns, value, weight, scale, config):
     twice = partial(jnp.repeat, repeats=2, axis=0)  # an imagined state, and the one after it, which the loss does not read
     policy = Namespace(log_prob=lambda action: twice(log_prob), entropy=lambda: twice(entropy))
-    learner = Namespace(
+    learner = network(
         scales={"extr": 1.0},
         critics={"extr": Namespace(score=lambda *trajectory: (returns, returns, value))},
         retnorms={"extr": lambda returns: (0.0, scale)},
