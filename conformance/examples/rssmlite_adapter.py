@@ -7,7 +7,6 @@ Their λ-return takes rewards and continues from step 1 on. Rewards and values a
 from importlib.metadata import version
 
 import torch
-from rssmlite.actor_critic import Critic
 from rssmlite.actor_critic import lambda_return as their_lambda_return
 from rssmlite.utils import kl_balancing, straight_through_sample, symexp, symlog  # noqa: F401
 
@@ -24,16 +23,8 @@ def kl_losses(posterior_logits, prior_logits, config):
 def draw_categorical(logits, unimix, seed, n):
     """They have no uniform mixture."""
     torch.manual_seed(seed)
-    return straight_through_sample(logits.expand(n, *logits.shape))
+    return straight_through_sample(logits.expand(n, *logits.shape)).argmax(-1)
 
 
 def lambda_return(reward, continue_, value, discount, lambda_):
     return their_lambda_return(reward[:, 1:], continue_[:, 1:], value, discount, lambda_)
-
-
-def update_slow_critic(slow, critic, decay):
-    slow_critic = Critic(1).make_ema(1 - decay)
-    slow_critic._target, online = ({name: torch.nn.Parameter(x.clone()) for name, x in given.items()} for given in (slow, critic))
-    slow_critic._target, online = torch.nn.ParameterDict(slow_critic._target), torch.nn.ParameterDict(online)
-    slow_critic.soft_update(online)
-    return dict(slow_critic._target.items())
