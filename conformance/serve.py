@@ -133,6 +133,8 @@ def answer(adapter: Any, request: Mapping[str, Any]) -> dict[str, Any]:
         return {"id": request.get("id"), "result": _result(adapter, request)}
     except ValueError as error:
         kind, message = "ValueError", str(error)
+    except KeyError as error:  # a parameter is missing: its name says it
+        kind, message = "KeyError", str(error.args[0] if error.args else error)
     except Exception as error:
         kind, message = type(error).__name__, traceback.format_exc(limit=-4)
     return {"id": request.get("id"), "error": {"kind": kind, "message": message}}

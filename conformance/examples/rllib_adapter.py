@@ -15,10 +15,11 @@ import gymnasium
 import torch
 from ray.rllib.algorithms.dreamerv3.torch.dreamerv3_torch_learner import DreamerV3TorchLearner as Learner
 from ray.rllib.algorithms.dreamerv3.torch.models.components.representation_layer import RepresentationLayer
-from ray.rllib.utils.torch_utils import inverse_symlog as symexp  # noqa: F401
+from ray.rllib.utils.torch_utils import inverse_symlog, symlog  # noqa: F401
 
 __version__ = version("ray")
 convert = torch.as_tensor
+symexp = inverse_symlog
 
 
 def edition():
