@@ -196,7 +196,8 @@ def load_file(path: Path) -> Any:
 def main() -> None:
     if len(sys.argv) != 2:
         sys.exit("usage: python -m conformance.serve my_adapter.py")
-    if not __package__:  # run as a file, its directory comes first on the path, where modules may hide those of the standard library
+    # Run as a file, its directory comes first on the path, where other modules may hide those of the standard library.
+    if not __package__ and os.path.realpath(sys.path[0]) == os.path.dirname(os.path.realpath(__file__)):
         del sys.path[0]
     # Replies have the pipe to themselves: what anything else prints, C libraries included, goes to standard error.
     replies = os.fdopen(os.dup(1), "wb")
