@@ -133,6 +133,8 @@ def answer(adapter: Any, request: Mapping[str, Any]) -> dict[str, Any]:
         return {"id": request.get("id"), "result": _result(adapter, request)}
     except ValueError as error:
         kind, message = "ValueError", str(error)
+    except KeyError as error:  # a parameter is missing: its name says it
+        kind, message = "KeyError", str(error.args[0] if error.args else error)
     except Exception as error:
         kind, message = type(error).__name__, traceback.format_exc(limit=-4)
     return {"id": request.get("id"), "error": {"kind": kind, "message": message}}
@@ -195,6 +197,9 @@ def load_file(path: Path) -> Any:
 def main() -> None:
     if len(sys.argv) != 2:
         sys.exit("usage: python -m conformance.serve my_adapter.py")
+    # Run as a file, its directory comes first on the path, where other modules may hide those of the standard library.
+    if not __package__ and os.path.realpath(sys.path[0]) == os.path.dirname(os.path.realpath(__file__)):
+        del sys.path[0]
     # Messages have the pipes to themselves: what anything else prints, C libraries included, goes to standard error, and what
     # anything else reads, programs that the adapter starts included, is empty.
     requests, replies = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")

@@ -302,6 +302,25 @@ def server(tmp_path: Path) -> Iterator[ProcessAdapter]:
     adapter.close()
 
 
+def test_neighbours_of_the_server_hide_no_standard_module(tmp_path: Path) -> None:
+    there = tmp_path / "there"
+    there.mkdir()
+    shutil.copy(ROOT / "conformance" / "serve.py", there / "serve.py")
+    (there / "statistics.py").write_text("mean = None", encoding="utf-8")
+    (tmp_path / "mine.py").write_text("import statistics\n\n\ndef symlog(x):\n    return statistics.mean([1, 2, 6]) * x", encoding="utf-8")
+    adapter = ProcessAdapter(shlex.join([sys.executable, str(there / "serve.py"), str(tmp_path / "mine.py")]), "float64", 60.0)
+    assert adapter.symlog(np.ones(2)).tolist() == [3.0, 3.0]
+    adapter.close()
+
+
+def test_a_missing_parameter_is_named(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text("def symlog(x):\n    return {}['reward/out/bias']", encoding="utf-8")
+    adapter = ProcessAdapter(shlex.join([sys.executable, "-m", "conformance.serve", str(tmp_path / "mine.py")]), "float64", 60.0)
+    with pytest.raises(KeyError, match=r"^'reward/out/bias'$"):
+        adapter.symlog(np.ones(2))
+    adapter.close()
+
+
 def test_the_server_alone(server: ProcessAdapter) -> None:
     assert (server.name, server.version, server.edition()) == ("mine", "1.5", "paper")
     assert result_of(server).status == "pass"
