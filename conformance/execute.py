@@ -89,7 +89,7 @@ def finish(check: Check, run: Run) -> Result:
         return Result(check, "fail", run.worst, run.compared, str(deviation), run.last_call)
     except CandidateLost as lost:
         return Result(check, "error", Worst(math.inf, math.inf, check.name), run.compared, str(lost), run.last_call)
-    except Exception:
+    except (Exception, SystemExit):  # an object that the candidate made may call sys.exit
         return Result(check, "error", Worst(math.inf, math.inf, check.name), run.compared, traceback.format_exc(limit=-4), run.last_call)
     if not run.compared:
         return Result(check, "error", run.worst, 0, "the check compared nothing")

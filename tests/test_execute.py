@@ -37,6 +37,15 @@ def test_what_the_candidate_raises_is_a_result() -> None:
     assert "oops" in result.message
 
 
+def test_a_candidate_cannot_end_the_kit() -> None:
+    class Replay:
+        def __init__(self, capacity: int, length: int) -> None:
+            raise SystemExit(0)
+
+    check = next(check for check in CHECKS.values() if check.uses == ("Replay",))
+    assert run_check(check, adapter(Replay=Replay), "float64", "paper").status == "error"
+
+
 def test_a_right_and_a_wrong_function() -> None:
     check = CHECKS["transforms.symlog_matches"]
     right = run_check(check, adapter(symlog=lambda x: np.sign(x) * np.log1p(np.abs(x))), "float64", "paper")
