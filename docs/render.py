@@ -108,10 +108,10 @@ def benchmark_table() -> str:
 
 
 def conformance_runs() -> dict[tuple[str, str, str], dict[str, Any]]:
-    """The committed runs of the kit: (candidate, dtype, profile) -> report of `conformance check --json`."""
+    """The committed runs of the kit: (candidate, dtype, edition) -> report of `conformance check --json`."""
     reports = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(RESULTS.glob("conformance-*.json"))]
-    order = ("jax", "torch", "float64", "float32", "bfloat16", "paper", "official")
-    keyed = {(report["candidate"], report["dtype"], report["profile"]): report for report in reports}
+    order = ("jax", "torch", "float64", "float32", "bfloat16", "paper", "2024-12")
+    keyed = {(report["candidate"], report["dtype"], report["edition"]): report for report in reports}
     return dict(sorted(keyed.items(), key=lambda item: tuple(map(order.index, item[0]))))
 
 
@@ -126,7 +126,7 @@ def conformance_summary() -> str:
         share = "no number" if worst["share"] is None else f"{worst['share']:.0%}"
         rows.append([*key, *counts, f"{numbers:,}", f"{share} ({name})"])
     return markdown_table(
-        ["backend", "dtype", "profile", "pass", "fail", "error", "not offered", "numbers compared", "worst, of allowed"], rows
+        ["backend", "dtype", "edition", "pass", "fail", "error", "not offered", "numbers compared", "worst, of allowed"], rows
     )
 
 
@@ -145,7 +145,7 @@ def conformance_chapters() -> str:
         return f"{passed} of {len(offered)}, {worst:.0%}"
 
     rows = [[prefix, *(cell(report, prefix) for report in runs.values())] for prefix in prefixes]
-    return markdown_table(["requirements", *(f"{backend}, {profile}" for backend, _, profile in runs)], rows)
+    return markdown_table(["requirements", *(f"{backend}, {edition}" for backend, _, edition in runs)], rows)
 
 
 def mutants() -> dict[str, dict[str, dict[str, Any]]]:
