@@ -1,0 +1,1 @@
+"""Adapters for packages of others: see docs/strangers.md."""
