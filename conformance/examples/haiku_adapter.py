@@ -35,7 +35,9 @@ def draw_parameters(spaces, config, seed):
         kinds = {"zeros": hk.initializers.Constant(0.0), "ones": hk.initializers.Constant(1.0)}
         values = {}
         for name, entry in parameter_table(config, spaces).items():
-            truncated = hk.initializers.VarianceScaling(entry.outscale**2, "fan_in", "truncated_normal") if entry.outscale else kinds["zeros"]
+            truncated = (
+                hk.initializers.VarianceScaling(entry.outscale**2, "fan_in", "truncated_normal") if entry.outscale else kinds["zeros"]
+            )
             values[name] = kinds.get(entry.initializer, truncated)(entry.shape, jnp.float32)
         return values
 

@@ -1,29 +1,46 @@
 """TorchRL: the components of its DreamerV3: transforms, RSSM, KL losses, returns, actor and critic losses, optimizer, update ratio.
 
 Written for torchrl 0.14.1. TorchRL computes norms, returns and moments in float32: check it with `--dtype float32`. Latents are flat there,
-rows of linear layers are outputs, and its loss modules work on TensorDicts: the modules that they call are replaced by ones that hand out
-given numbers. Where it samples, `torch.rand` hands out the given noise. What no public function gives (the uniform mixture, sampling,
-single layers) is taken from the functions that its own modules call.
+and rows of linear layers are outputs. `torchrl_losses` holds what its loss modules compute. Where a rollout samples, `torch.rand` hands out
+the given noise. What no public function gives (the uniform mixture, sampling, single layers, the returns along a replayed sequence) is
+taken from the functions that TorchRL's own modules call.
 """
 
+import warnings
 from unittest import mock
 
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule, TensorDictSequential
+from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl import __version__
 from torchrl.modules import RSSMPosteriorV3, RSSMPriorV3, RSSMRolloutV3, SymExpTwoHot
 from torchrl.modules.functional import symexp, symlog
 from torchrl.modules.models import model_based
 from torchrl.modules.value_norm import PercentileValueNorm
-from torchrl.objectives import DreamerV3ActorLoss, DreamerV3ValueLoss, SoftUpdate, ValueEstimators, categorical_kl_terms, dreamer_v3
+from torchrl.objectives import categorical_kl_terms, dreamer_v3
 from torchrl.objectives import two_hot_cross_entropy as symexp_twohot_loss
 from torchrl.objectives import two_hot_decode as symexp_twohot_mean
 from torchrl.objectives import two_hot_encode as twohot
 from torchrl.trainers.algorithms.dreamer_v3 import DreamerV3Optimizer, DreamerV3UpdateRatio
 
-__all__ = ["__version__", "symexp", "symexp_twohot_loss", "symexp_twohot_mean", "symlog", "twohot"]
+from conformance.examples.torchrl_losses import (
+    actor_loss,
+    critic_loss,
+    cumulative_weights,
+    lambda_return,
+    replay_critic_loss,
+    update_slow_critic,
+)
+
+__all__ = [
+    *("__version__", "symexp", "symexp_twohot_loss", "symexp_twohot_mean", "symlog", "twohot"),
+    *("actor_loss", "critic_loss", "cumulative_weights", "lambda_return", "replay_critic_loss", "update_slow_critic"),
+]
+
+
+def setup(dtype):
+    warnings.filterwarnings("ignore", category=UserWarning, module="torchrl")
 
 
 def convert(array):
@@ -60,9 +77,6 @@ def rms_norm(x, scale, epsilon):
     return model_based._dreamer_v3_rms_norm(x, scale, epsilon)
 
 
-# Networks: what they hold, loaded by name.
-
-
 def dense_state(params, name):
     return [{"weight": params[f"{name}/kernel"].mT, "bias": params[f"{name}/bias"]}, {"weight": params[f"{name}/scale"]}, {}]
 
@@ -76,13 +90,14 @@ def numbered(parts):
     return {f"{index}.{key}": value for index, part in enumerate(parts) for key, value in part.items()}
 
 
+def sizes(config):
+    latents = {"num_categoricals": config.stoch, "num_classes": config.classes, "unimix": config.latent_unimix}
+    return {**latents, "hidden_dim": config.units, "rnn_hidden_dim": config.deter, "norm_eps": config.norm_epsilon}
+
+
 def prior_network(params, config):
-    actions = params["rssm/embed_action/kernel"].shape[0]
-    sizes = {"num_categoricals": config.stoch, "num_classes": config.classes, "hidden_dim": config.units, "rnn_hidden_dim": config.deter}
-    depth = {"num_blocks": config.blocks, "prior_num_layers": config.prior_layers}
-    network = RSSMPriorV3(
-        action_dim=actions, recurrent_model="block_gru", norm_eps=config.norm_epsilon, unimix=config.latent_unimix, **sizes, **depth
-    )
+    kind = {"recurrent_model": "block_gru", "num_blocks": config.blocks, "prior_num_layers": config.prior_layers}
+    network = RSSMPriorV3(action_dim=len(params["rssm/embed_action/kernel"]), **kind, **sizes(config))
     network.rnn_to_prior_projector.load_state_dict(head_state(params, "rssm/prior", config.prior_layers))
     for part, name in (("belief", "embed_deter"), ("state", "embed_stoch"), ("action", "embed_action")):
         getattr(network.rnn, f"{part}_projection").load_state_dict(numbered(dense_state(params, f"rssm/{name}")))
@@ -93,11 +108,8 @@ def prior_network(params, config):
 
 
 def posterior_network(params, config):
-    tokens = params["rssm/posterior/hidden0/kernel"].shape[0] - config.deter
-    sizes = {"num_categoricals": config.stoch, "num_classes": config.classes, "hidden_dim": config.units, "rnn_hidden_dim": config.deter}
-    network = RSSMPosteriorV3(
-        obs_embed_dim=tokens, use_rms_norm=True, num_layers=config.posterior_layers, norm_eps=config.norm_epsilon, unimix=config.latent_unimix, **sizes
-    )
+    tokens = len(params["rssm/posterior/hidden0/kernel"]) - config.deter
+    network = RSSMPosteriorV3(obs_embed_dim=tokens, use_rms_norm=True, num_layers=config.posterior_layers, **sizes(config))
     network.obs_rnn_to_post_projector.load_state_dict(head_state(params, "rssm/posterior", config.posterior_layers))
     return network
 
@@ -120,17 +132,16 @@ def observe(params, carry, tokens, prev_action, is_first, uniform, config):
         TensorDictModule(prior_network(params, config), in_keys=["state", "belief", "action"], out_keys=[*following]),
         TensorDictModule(
             posterior_network(params, config),
-            in_keys=[("next", "belief"), ("next", "encoded")],
+            in_keys=[("next", "belief"), ("next", "encoded_latents")],
             out_keys=[("next", "posterior_logits"), ("next", "state")],
         ),
-        reset_key="is_first",
     )
     rows, steps = is_first.shape
     start = {"state": carry["stoch"].flatten(-2), "belief": carry["deter"]}
     first = {key: torch.cat([x[:, None], x.new_zeros(rows, steps - 1, x.shape[-1])], 1) for key, x in start.items()}
-    data = TensorDict({**first, "action": prev_action, "is_first": is_first[..., None], "next": {"encoded": tokens}}, [rows, steps])
+    data = TensorDict({**first, "action": prev_action, "is_init": is_first[..., None], "next": {"encoded_latents": tokens}}, [rows, steps])
     noise = uniform.transpose(0, 1)[:, None].expand(-1, 2, -1, -1)
-    with mock.patch.object(torch, "rand", lambda *shape, **where: noise):
+    with mock.patch.object(torch, "rand", return_value=noise):
         result = rollout(data)["next"]
     return {"deter": result["belief"], "stoch": result["state"], "logits": result["posterior_logits"]}
 
@@ -142,7 +153,11 @@ def imagine(params, carry, action, uniform, config):
         _, stoch, deter = network(stochs[-1], deters[-1], action[:, t], _uniform=uniform[:, t])
         deters.append(deter)
         stochs.append(stoch)
-    return {"deter": torch.stack(deters, 1), "stoch": torch.stack(stochs, 1).unflatten(-1, (config.stoch, config.classes)), "action": action}
+    return {
+        "deter": torch.stack(deters, 1),
+        "stoch": torch.stack(stochs, 1).unflatten(-1, (config.stoch, config.classes)),
+        "action": action,
+    }
 
 
 def kl_losses(posterior_logits, prior_logits, config):
@@ -152,132 +167,6 @@ def kl_losses(posterior_logits, prior_logits, config):
     rows = posterior_logits.shape[:-2]
     dynamics, representation = torch.vmap(one)(*(x.reshape(-1, *x.shape[-2:]) for x in (posterior_logits, prior_logits)))
     return dynamics.reshape(rows), representation.reshape(rows)
-
-
-# Returns and losses: an imagined state holds its own value, continuation, log-probability and entropy.
-
-
-class Column(nn.Module):
-    """Reads one number of a state."""
-
-    def __init__(self, index):
-        super().__init__()
-        self.index = index
-
-    def forward(self, state):
-        return state[..., self.index, None]
-
-
-class Policy(nn.Module):
-    """An actor whose distribution has the log-probability and the entropy that the state holds."""
-
-    in_keys = ("state",)
-
-    def get_dist(self, data):
-        dist = mock.Mock()
-        dist.log_prob = lambda action: Column(2)(data["state"])
-        dist.entropy = lambda: Column(3)(data["state"])
-        return dist
-
-
-class Dream(nn.Module):
-    """A world model that has already dreamt: reset and rollout return what is given."""
-
-    def __init__(self, data):
-        super().__init__()
-        self.data = data
-
-    def reset(self, data):
-        return data
-
-    def rollout(self, **options):
-        return self.data.clone()
-
-
-def actor_loss_module(state, next_state, reward, discount, lambda_, **options):
-    """The loss module and the data of one dream: state and next_state [N, H, 4], reward [N, H]."""
-    data = TensorDict({"state": state, "belief": state, "action": state, "next": {"state": next_state, "belief": state, "reward": reward[..., None]}}, reward.shape)
-    value, continuation = (TensorDictModule(Column(i), ["state"], [key]) for i, key in ((0, "state_value"), (1, "continuation")))
-    loss = DreamerV3ActorLoss(Policy(), value, Dream(data), continuation_model=continuation, use_reinforce=True, **options)
-    loss.make_value_estimator(ValueEstimators.TDLambda, gamma=discount, lmbda=lambda_)
-    return loss, data
-
-
-def dreamt(reward, continue_, value, discount, lambda_):
-    state = torch.stack([value, continue_, torch.zeros_like(value), torch.zeros_like(value)], -1)
-    loss, data = actor_loss_module(state[:, :-1], state[:, 1:], reward[:, 1:], discount, lambda_)
-    return loss(data)[1]
-
-
-def lambda_return(reward, continue_, value, discount, lambda_):
-    return dreamt(reward, continue_, value, discount, lambda_)["lambda_target"][..., 0]
-
-
-def cumulative_weights(continue_, discount):
-    return dreamt(torch.zeros_like(continue_), continue_, torch.zeros_like(continue_), discount, 0.95)["discount_weight"][..., 0]
-
-
-def actor_loss(log_prob, entropy, returns, value, weight, scale, config):
-    def one(log_prob, entropy, returns, value, weight):
-        """Of a dream of one step whose reward is the return, after which nothing follows."""
-        state = torch.stack([value, weight, log_prob, entropy], -1).reshape(1, 1, 4)
-        module, data = actor_loss_module(state, torch.zeros(1, 1, 4), returns.reshape(1, 1), 1.0, 1.0, entropy_bonus=config.entropy_scale)
-        module.eval()
-        module.retnorm.high.fill_(scale)
-        module.retnorm.min_scale = 0.0
-        return module(data)[0]["loss_actor"]
-
-    rows = (x.flatten() for x in (log_prob, entropy, returns, value, weight))
-    return torch.stack([one(*numbers) for numbers in zip(*rows, strict=True)]).reshape(log_prob.shape)
-
-
-class Given(nn.Module):
-    """A critic that is its own output, or any tensors by name."""
-
-    def __init__(self, **tensors):
-        super().__init__()
-        self.tensors = nn.ParameterDict(tensors)
-
-    def forward(self, state):
-        return self.tensors["logits"]
-
-
-def value_loss_module(config, logits, slow_logits):
-    network = TensorDictSequential(
-        TensorDictModule(Given(logits=logits), ["state"], ["state_value_logits"]),
-        TensorDictModule(SymExpTwoHot(config.bins), ["state_value_logits"], ["state_value"]),
-    )
-    loss = DreamerV3ValueLoss(
-        network, "two_hot", num_value_bins=config.bins, slow_critic_regularization=config.slow_critic_scale, reduction="none"
-    )
-    loss.target_value_model_params["module", "0", "module", "tensors", "logits"].data.copy_(slow_logits)
-    return loss
-
-
-def critic_loss(logits, slow_logits, returns, weight, config):
-    data = {"state": returns[..., None], "lambda_target": returns[..., None], "discount_weight": weight[..., None]}
-    return value_loss_module(config, logits, slow_logits)(TensorDict(data, returns.shape))[0]["loss_value"]
-
-
-def replay_critic_loss(logits, slow_logits, returns, is_last, config):
-    """The return of a step is the reward of the next one, which is terminal."""
-    longer = [torch.cat([x, x[:, -1:]], 1) for x in (logits, slow_logits)]
-    reward, last = torch.cat([returns[:, :1], returns], 1)[..., None], torch.cat([is_last, is_last[:, :1]], 1).bool()[..., None]
-    following = {"reward": reward, "done": last, "terminated": torch.ones_like(last)}
-    data = TensorDict({"state": reward, "bootstrap": torch.zeros_like(reward), "next": following}, reward.shape[:2])
-    return value_loss_module(config, *longer).replay_value_loss(data)["loss_replay_value"]
-
-
-def update_slow_critic(slow, critic, decay):
-    def held(tensors):
-        return TensorDictModule(Given(**{name: x for name, x in tensors.items() if name.startswith("critic/")}), ["state"], ["state_value"])
-
-    loss = DreamerV3ValueLoss(held(critic), slow_critic_regularization=1.0)
-    targets = loss.target_value_model_params["module", "tensors"]
-    for name, value in slow.items():
-        targets[name].data.copy_(value)
-    SoftUpdate(loss, eps=decay).step()
-    return {name: targets[name] for name in slow}
 
 
 def replay_lambda_return(reward, is_last, is_terminal, annotation, discount, lambda_):
@@ -308,9 +197,6 @@ def update_return_range(low, high, returns, config):
 
 def return_scale(low, high, limit):
     return percentile_norm(low, high, min_scale=limit).scale()[0]
-
-
-# Optimizer and schedule.
 
 
 def updated(params, gradients, second_moments, momenta, step, **options):
