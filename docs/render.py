@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from conformance.commands.mutants import is_named
+from docs import strangers
 from spec import benchmarks, hyperparameters, profiles, sizes
 from train.report import catalogue
 
@@ -250,6 +251,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "replay_image": functools.partial(replay_table, "image"),
     "replay_small": functools.partial(replay_table, "small"),
     "metrics": catalogue.markdown,
+    "strangers": strangers.summary_table,
+    "stranger_findings": strangers.finding_sections,
     "loop_shares": loop_shares,
     "loop_memory": loop_memory,
     "lockstep_free": lambda: lockstep_table("free", ("float64",)),

@@ -34,9 +34,19 @@ from conformance.examples.torchrl_losses import (
 )
 
 __all__ = [
-    *("__version__", "symexp", "symexp_twohot_loss", "symexp_twohot_mean", "symlog", "twohot"),
-    *("actor_loss", "critic_loss", "cumulative_weights", "lambda_return", "replay_critic_loss", "update_slow_critic"),
-]
+    "__version__",
+    "actor_loss",
+    "critic_loss",
+    "cumulative_weights",
+    "lambda_return",
+    "replay_critic_loss",
+    "symexp",
+    "symexp_twohot_loss",
+    "symexp_twohot_mean",
+    "symlog",
+    "twohot",
+    "update_slow_critic",
+]  # offered as they are
 
 
 def setup(dtype):
