@@ -1,6 +1,6 @@
 """optax: adaptive gradient clipping, LaProp put together of RMS scaling and a moving average, warmup, losses, moving averages.
 
-Written for optax 0.2.8. `learning_rate` is what `scale_by_learning_rate` would multiply by.
+Written for optax 0.2.8. Gradients are clipped over all axes; the default there is by output unit. `learning_rate` is what `scale_by_learning_rate` would multiply by.
 """
 
 import jax
@@ -17,7 +17,7 @@ def setup(dtype):
 
 
 def adaptive_gradient_clip(gradient, parameter, clip, epsilon):
-    transformation = optax.adaptive_grad_clip(clip, epsilon)
+    transformation = optax.adaptive_grad_clip(clip, epsilon, axis=tuple(range(gradient.ndim)))
     return transformation.update(gradient, transformation.init(parameter), parameter)[0]
 
 
