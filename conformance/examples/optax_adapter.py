@@ -1,6 +1,7 @@
 """optax: adaptive gradient clipping, LaProp put together of RMS scaling and a moving average, warmup, losses, moving averages.
 
-Written for optax 0.2.8. Gradients are clipped over all axes; the default there is by output unit. `learning_rate` is what `scale_by_learning_rate` would multiply by.
+Written for optax 0.2.8. Gradients are clipped over all axes; the default there is by output unit. `learning_rate` is what
+`scale_by_learning_rate` would multiply by.
 """
 
 import jax
