@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from conformance.adapter import INTERFACE, OBJECTS, RESULTS, Adapter
+from conformance.adapter import INTERFACE, OBJECTS, RESULTS, Adapter, Array
 from conformance.errors import UserError
 from spec import Config
 
@@ -15,6 +15,12 @@ MAPPINGS = frozenset(
     name for name in INTERFACE if str(inspect.signature(getattr(Adapter, name)).return_annotation).startswith("collections.abc.Mapping")
 )
 """Functions whose result is a mapping."""
+
+TAKE_ARRAYS = {
+    name: tuple(parameter.annotation is Array for parameter in inspect.signature(getattr(Adapter, name)).parameters.values())[1:]
+    for name in INTERFACE
+}
+"""Every function -> for each of its arguments, whether it is an array. A single number then comes as an array without axes."""
 
 LATENTS = ("stoch", "logits", "posterior", "prior")
 """Where latents stand in a result: under these keys, or as the whole result of functions with these names."""
@@ -48,6 +54,8 @@ class ForeignAdapter(abc.ABC):
             raise AttributeError(name)
 
         def function(*arguments: Any) -> Any:
+            kinds = zip(arguments, TAKE_ARRAYS[name], strict=True)
+            arguments = tuple(np.asarray(value) if is_array and np.isscalar(value) else value for value, is_array in kinds)
             result = self.call(name, arguments)
             return result if name in OBJECTS else arranged(name, arguments, result)
 

@@ -22,6 +22,7 @@ from typing import Any
 
 from conformance.commands.mutants import is_named
 from conformance.requirements import chapter_of, requirements
+from docs import strangers
 from spec import Edition, benchmarks, editions, hyperparameters, profiles, sizes
 from train.report import catalogue
 
@@ -284,6 +285,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "replay_image": functools.partial(replay_table, "image"),
     "replay_small": functools.partial(replay_table, "small"),
     "metrics": catalogue.markdown,
+    "strangers": strangers.summary_table,
+    "stranger_findings": strangers.finding_sections,
     "loop_shares": loop_shares,
     "loop_memory": loop_memory,
     "lockstep_free": lambda: lockstep_table("free", ("float64",)),

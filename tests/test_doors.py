@@ -169,6 +169,26 @@ def test_convert_is_applied_to_every_array() -> None:
     assert set(kinds) == {torch.Tensor, Config}
 
 
+def test_a_number_for_an_array_is_an_array() -> None:
+    """So that `x.shape` and `x.dtype` are there; what is a number in the interface stays one."""
+    seen: list[Any] = []
+
+    def normal_sample(mean: Any, std: Any, normal: Any) -> Any:
+        seen.extend((mean, std, normal))
+        return mean + std * normal
+
+    def percentile(values: Any, q: Any) -> Any:
+        seen.append(q)
+        return q
+
+    adapter = module(normal_sample=normal_sample, percentile=percentile)
+    assert adapter.normal_sample(0.5, np.array(2.0), -1) == -1.5
+    assert [type(value) for value in seen] == [np.ndarray] * 3
+    assert [value.shape for value in seen] == [()] * 3
+    assert adapter.percentile(np.zeros(3), 5.0) == 5.0
+    assert type(seen[3]) is float
+
+
 def test_setup_and_what_an_adapter_says_of_itself() -> None:
     seen = []
     mine = types.ModuleType("mine")
