@@ -7,6 +7,7 @@ functions that it needs; where the adapter does not offer one of these, the chec
 
 import dataclasses
 import math
+import time
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
@@ -18,6 +19,8 @@ EPSILON = {"float64": 2.0**-52, "float32": 2.0**-23, "bfloat16": 2.0**-7}
 SMALLEST_NORMAL = {"float64": 2.0**-1022, "float32": 2.0**-126, "bfloat16": 2.0**-126}
 # Rounding of one function, relative to the magnitude of what it sums. float64 is held to 1e-12; the others to multiples of their epsilon.
 BOUND = {"float64": 1e-12, "float32": 64 * EPSILON["float32"], "bfloat16": 16 * EPSILON["bfloat16"]}
+HUGE, TINY = 1e9, 1e-30  # sizes between which a number is ordinary; the outermost bins are below
+SHRINKING = 2.0  # seconds in which hypothesis may look for a smaller case that deviates
 COPIED = 2**16  # numbers of an array up to which a failing input is kept as it was
 
 
@@ -90,17 +93,28 @@ class Run:
     """One check on one adapter.
 
     dtype: precision of the candidate. profile: name of the profile that configurations are drawn from. seed and examples: of the drawn
-    cases. shrink: whether hypothesis makes a case that deviates smaller, which takes longer. `compared` counts numbers compared, so that
-    a check that compares nothing can be told from one that passes.
+    cases. shrink: whether hypothesis makes a case that deviates smaller, which takes longer. stand_in: an adapter that answers in place of
+    the candidate where the input is extreme (`is_extreme`, or to be refused), so that a deviation is one with ordinary input; None
+    for nobody. `compared` counts numbers compared, so that a check that compares nothing can be told from one that passes.
     """
 
-    def __init__(self, adapter: object, dtype: str, profile: str, seed: int = 0, examples: int = 25, shrink: bool = True) -> None:
+    def __init__(
+        self,
+        adapter: object,
+        dtype: str,
+        profile: str,
+        seed: int = 0,
+        examples: int = 25,
+        shrink: bool = True,
+        stand_in: object | None = None,
+    ) -> None:
         self.adapter = adapter
         self.dtype = dtype
         self.profile = profile
         self.seed = seed
         self.examples = examples
         self.shrink = shrink
+        self.stand_in = stand_in
         self.worst = Worst()
         self.compared = 0
         self.last_call: Call | None = None  # of the candidate; after a deviation, that of the smallest case that deviates
@@ -124,7 +138,12 @@ class Run:
 
     def call(self, function: str, *args: Any) -> Any:
         self.last_call = Call(function, _copied(args))
-        return getattr(self.adapter, function)(*args)
+        return getattr(self.answering(function, args), function)(*args)
+
+    def answering(self, function: str, args: Any) -> object:
+        """The candidate, or what stands in for it."""
+        extreme = hasattr(self.stand_in, function) and is_extreme(args)
+        return self.stand_in if extreme else self.adapter
 
     def expect(self, function: str, args: tuple[Any, ...], expected: Any, **how: Any) -> Any:
         """Calls the candidate and compares its result; returns the result. `how` is passed to `compare`."""
@@ -169,11 +188,20 @@ class Run:
             raise Deviation(f"{where} does not hold")
 
     def refuses(self, function: str, *args: Any, naming: Iterable[str] = ()) -> None:
-        """Raises `Deviation` unless the candidate raises a ValueError with a message; `naming` are words that it must hold."""
+        """Raises `Deviation` unless the candidate raises a ValueError with a message; `naming` are words that it must hold.
+
+        Somebody else's program, an adapter that `refuses_anyhow`, may raise any exception.
+        """
         self.compared += 1
+        if self.stand_in is not None:
+            return
         try:
             result = self.call(function, *args)
-        except ValueError as error:
+        except Exception as error:
+            if getattr(self.adapter, "refuses_anyhow", False):
+                return
+            if not isinstance(error, ValueError):
+                raise
             self.holds(f"the error message of {function}", bool(str(error)))
             for word in naming:
                 self.holds(f"the error message of {function} names {word!r} ({_brief(str(error))})", word in str(error))
@@ -185,7 +213,12 @@ class Run:
         """Decorator: runs the function on cases drawn by hypothesis, and shrinks the first that deviates."""
 
         def decorate(body: Callable[..., None]) -> None:
-            wrapped = hypothesis.given(**strategies)(body)
+            shrinking = _Shrinking(body)
+
+            def one_case(**drawn: Any) -> None:
+                shrinking.run(**drawn)
+
+            wrapped = hypothesis.given(**strategies)(one_case)
             wrapped = hypothesis.settings(
                 max_examples=self.examples,
                 deadline=None,
@@ -194,7 +227,10 @@ class Run:
                 phases=[phase for phase in hypothesis.Phase if self.shrink or phase is not hypothesis.Phase.shrink],
                 report_multiple_bugs=False,  # several deviations would come as a group, which is no Deviation
             )(wrapped)
-            hypothesis.seed(self.seed)(wrapped)()
+            try:
+                hypothesis.seed(self.seed)(wrapped)()
+            except _Enough:
+                shrinking.repeat_smallest()
 
         return decorate
 
@@ -208,7 +244,8 @@ class Run:
         self.compared += expected.size
         if not expected.size:
             return
-        deviation = relative_deviation(actual, expected, magnitude, self.tiny / self.u)
+        scale = scale_of(expected, magnitude, self.tiny / self.u)
+        deviation = relative_deviation(actual, expected, scale)
         index = tuple(map(int, np.unravel_index(np.argmax(deviation), deviation.shape)))
         largest = float(deviation[index])
         share = largest / bound if bound else (0.0 if largest == 0 else math.inf)
@@ -218,7 +255,8 @@ class Run:
         if share > 1:
             self._note(actual, expected, index)
             got, wanted = float(actual[index]), float(expected[index])
-            raise Deviation(f"{place}: got {got!r}, expected {wanted!r}, off by {largest:.3g}, allowed {bound:.3g}")
+            difference = f", differs by {abs(got - wanted):.3g}, allowed {bound * scale[index]:.3g}" if math.isfinite(got - wanted) else ""
+            raise Deviation(f"{place}: got {got!r}, expected {wanted!r}{difference}")
 
     def _note(self, got: np.ndarray, expected: np.ndarray, index: tuple[int, ...] | None) -> None:
         if self.last_call is not None:
@@ -249,15 +287,70 @@ def _brief(value: Any) -> str:
     return text if len(text) <= 120 else text[:117] + "..."
 
 
-def relative_deviation(actual: np.ndarray, expected: np.ndarray, magnitude: Any, floor: float) -> np.ndarray:
-    """|actual - expected| / magnitude, with infinity where only one is NaN or infinities differ."""
+def is_extreme(value: Any) -> bool:
+    """Whether there is a NaN, an infinity, a tiny or a huge number among the real numbers of a nested value."""
+    if isinstance(value, Mapping):
+        return any(map(is_extreme, value.values()))
+    if isinstance(value, tuple | list):
+        return any(map(is_extreme, value))
+    if not isinstance(value, float | np.floating | np.ndarray) or np.asarray(value).dtype.kind != "f":
+        return False
+    size = np.abs(value)
+    return not bool(np.all((size == 0) | ((size >= TINY) & (size <= HUGE))))
+
+
+class _Enough(BaseException):
+    """No more time for smaller cases. Not an Exception: hypothesis would take it for another way to fail."""
+
+
+class _Shrinking:
+    """Runs the body of a property; ends the search for a smaller case that deviates some seconds after the first."""
+
+    def __init__(self, body: Callable[..., None]) -> None:
+        self._body = body
+        self._since, self._size = math.inf, math.inf
+        self._smallest: dict[str, Any] = {}
+
+    def run(self, **drawn: Any) -> None:
+        if time.monotonic() - self._since > SHRINKING:
+            raise _Enough
+        try:
+            self._body(**drawn)
+        except hypothesis.errors.UnsatisfiedAssumption:
+            raise
+        except Exception:
+            self._since = min(self._since, time.monotonic())
+            if (size := _count(drawn)) <= self._size:
+                self._size, self._smallest = size, drawn
+            raise
+
+    def repeat_smallest(self) -> None:
+        """Fails once more with the smallest case that was found."""
+        self._body(**self._smallest)
+        raise Deviation("a case that deviated does not deviate again: the candidate is not deterministic")
+
+
+def _count(value: Any) -> int:
+    """How many numbers a nested value holds."""
+    if isinstance(value, Mapping):
+        return sum(map(_count, value.values()))
+    return sum(map(_count, value)) if isinstance(value, tuple | list) else int(np.size(value))
+
+
+def scale_of(expected: np.ndarray, magnitude: Any, floor: float) -> np.ndarray:
+    """What deviations of each element are relative to: see `Run.compare`."""
     with np.errstate(all="ignore"):
         if magnitude is None:
             magnitude = np.abs(expected)
         elif isinstance(magnitude, str):
             magnitude = np.max(np.abs(expected), where=np.isfinite(expected), initial=0.0)
         scale = np.maximum(np.broadcast_to(np.asarray(magnitude, np.float64), expected.shape), floor)
-        scale = np.where(np.isfinite(scale), scale, 1.0)
+    return np.where(np.isfinite(scale), scale, 1.0)
+
+
+def relative_deviation(actual: np.ndarray, expected: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """|actual - expected| / scale, with infinity where only one is NaN or infinities differ."""
+    with np.errstate(all="ignore"):
         difference = np.abs(actual - expected) / scale
     same = (actual == expected) | (np.isnan(actual) & np.isnan(expected))
     return np.where(same, 0.0, np.where(np.isfinite(difference), difference, np.inf))

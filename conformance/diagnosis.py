@@ -1,7 +1,9 @@
 """From deviations to the mistake: which mutant gives the numbers of the candidate where the checks fail.
 
 A failing check is run again on the candidate with a note of every call and its result: its trace. The same check is run on each mutant
-that it reaches. A mutant explains the check if its results agree with the trace, also where those of the reference do not.
+that it reaches. A mutant explains the check if its results agree with the trace, also where those of the reference do not. Where a
+check fails with ordinary input, the trace is made of that alone: what is done with NaN and infinities would hide the mistake. Of
+mutants that explain the same, those are named that also agree after the first deviation.
 """
 
 import copy
@@ -64,7 +66,8 @@ def diagnose(adapter: object, results: Iterable[Result], dtype: str, profile: st
     candidate = _Candidate(adapter, (dtype, profile, seed, examples), {result.check.name: result.status for result in results})
     failing = [result.check for result in results if result.status in ("fail", "error")]
     failing.sort(key=lambda check: (check.level, _of_derivatives(check), candidate.size(check), check.name))
-    evidence = {check: trace for check in failing if (trace := candidate.trace(check))}
+    traces = {check: trace for check in failing if (trace := candidate.trace(check))}
+    evidence = dict(sorted(traces.items(), key=lambda item: not item[1].ordinary))
     explained = {
         mutant: {check for check, trace in evidence.items() if candidate.explains(mutant, check, trace)}
         for mutant in _suspects(candidate, evidence)
@@ -102,6 +105,7 @@ def _best(candidate: "_Candidate", explained: dict[Mutant, set[Check]], passing:
     tied = [mutant for mutant, checks in explained.items() if len(checks) == most]
     if len(tied) == 1:
         return tied
+    tied = [mutant for mutant in tied if all(candidate.follows_to_the_end(mutant, check) for check in explained[mutant])] or tied
     return [mutant for mutant in tied if not candidate.contradicts(mutant, passing)] or tied
 
 
@@ -115,7 +119,13 @@ class _Call:
     how: dict[str, Any] | None = None
 
 
-_Trace = list[_Call]
+@dataclasses.dataclass
+class _Trace:
+    """The calls of a check. ordinary: with extreme input they are the reference's. to_the_end: also those after the first deviation."""
+
+    ordinary: bool
+    to_the_end: bool = False
+    calls: list[_Call] = dataclasses.field(default_factory=list)
 
 
 class _Candidate:
@@ -124,6 +134,7 @@ class _Candidate:
     def __init__(self, adapter: object, settings: tuple[str, str, int, int], statuses: dict[str, str]) -> None:
         self.adapter, self.settings, self.statuses = adapter, settings, statuses
         self._explained: dict[tuple[str, str], bool] = {}
+        self._whole: dict[str, _Trace] = {}
 
     def size(self, check: Check) -> int:
         """How many numbers it compares."""
@@ -136,9 +147,12 @@ class _Candidate:
         """
         if missing(NumpyAdapter(), check) or (_of_derivatives(check) and self.statuses.get(VALUES) in ("fail", "error")):
             return None
-        run = _Recorder(self.adapter, *self.settings)
-        finish(check, run)
-        return None if self._follows(NumpyAdapter(), check, run.calls) else run.calls
+        for ordinary in (True, False):
+            run = _Recorder(self.adapter, *self.settings, _Trace(ordinary))
+            finish(check, run)
+            if not self._follows(NumpyAdapter(), check, run.trace):
+                return run.trace
+        return None
 
     def explains(self, mutant: Mutant, check: Check, trace: _Trace) -> bool:
         key = (mutant.name, check.name)
@@ -150,6 +164,13 @@ class _Candidate:
         """Whether a check that the candidate passes fails on the mutant."""
         rows = {target.partition(".")[0] for target in mutant.edits}
         return any(self._fails(mutant, check) for check in sorted(passing, key=lambda check: check.name.partition(".")[0] not in rows))
+
+    def follows_to_the_end(self, mutant: Mutant, check: Check) -> bool:
+        if check.name not in self._whole:
+            run = _Recorder(self.adapter, *self.settings, _Trace(ordinary=True, to_the_end=True))
+            finish(check, run)
+            self._whole[check.name] = run.trace
+        return self._follows(MutantAdapter(mutant), check, self._whole[check.name])
 
     def _may_explain(self, mutant: Mutant, check: Check) -> bool:
         """What changes a loss is not the mistake of a candidate whose losses are right. This is said fast, derivatives are slow."""
@@ -171,12 +192,16 @@ class _Candidate:
 class _Recorder(Run):
     """A run that notes every call, those of objects that the candidate makes included."""
 
-    def __init__(self, adapter: object, dtype: str, profile: str, seed: int, examples: int) -> None:
-        super().__init__(adapter, dtype, profile, seed, examples, shrink=False)
-        self.calls: _Trace = []
+    def __init__(self, adapter: object, dtype: str, profile: str, seed: int, examples: int, trace: _Trace) -> None:
+        super().__init__(adapter, dtype, profile, seed, examples, shrink=False, stand_in=NumpyAdapter() if trace.ordinary else None)
+        self.trace = trace
+
+    @property
+    def calls(self) -> list[_Call]:
+        return self.trace.calls
 
     def call(self, function: str, *args: Any) -> Any:
-        made = self.noted(function, getattr(self.adapter, function), *args)
+        made = self.noted(function, getattr(self.answering(function, args), function), *args)
         return _Object(self, made) if isinstance(getattr(NumpyAdapter(), function, None), type) else made
 
     def expect(self, function: str, args: tuple[Any, ...], expected: Any, **how: Any) -> Any:
@@ -186,6 +211,18 @@ class _Recorder(Run):
             self.calls[-1].how = how
         self.compare(function, actual, expected, **how)
         return actual
+
+    def compare(self, where: str, actual: Any, expected: Any, **how: Any) -> None:
+        if not self.trace.to_the_end:
+            super().compare(where, actual, expected, **how)
+
+    def exact(self, where: str, actual: Any, expected: Any) -> None:
+        if not self.trace.to_the_end:
+            super().exact(where, actual, expected)
+
+    def holds(self, where: str, condition: Any) -> None:
+        if not self.trace.to_the_end:
+            super().holds(where, condition)
 
     def noted(self, name: str, function: Any, *args: Any, **options: Any) -> Any:
         entry = _Call(name)
@@ -208,20 +245,20 @@ class _Recorder(Run):
 class _Follower(_Recorder):
     """A run that compares every call with the same call of a trace, and ends at the first that differs."""
 
-    def __init__(self, adapter: object, dtype: str, profile: str, seed: int, examples: int, trace: _Trace) -> None:
-        super().__init__(adapter, dtype, profile, seed, examples)
-        self.trace = trace
+    def __init__(self, adapter: object, dtype: str, profile: str, seed: int, examples: int, followed: _Trace) -> None:
+        super().__init__(adapter, dtype, profile, seed, examples, _Trace(followed.ordinary, followed.to_the_end))
+        self.followed = followed.calls
         self.differs = False
 
     @property
     def agrees(self) -> bool:
-        return not self.differs and len(self.calls) >= min(len(self.trace), TRACE_LENGTH)
+        return not self.differs and len(self.calls) >= min(len(self.followed), TRACE_LENGTH)
 
     def note(self, entry: _Call) -> None:
         super().note(entry)
         position = len(self.calls) - 1
-        if not self.differs and position < len(self.trace):
-            self.differs = not self._same(entry, self.trace[position])
+        if not self.differs and position < len(self.followed):
+            self.differs = not self._same(entry, self.followed[position])
         if self.differs:
             raise Deviation("another result than in the trace")
 

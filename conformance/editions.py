@@ -18,7 +18,7 @@ from conformance.adapter import OBJECTS
 from conformance.adapters.numpy_adapter import NumpyAdapter
 from conformance.check import CHECKS, Check, Run, Worst
 from conformance.diagnosis import AGREEMENT, DERIVATIVES, VALUES
-from conformance.execute import Result, finish, missing, not_offered, run_check
+from conformance.execute import FAILING, Result, Settings, finish, missing, not_offered
 from conformance.mutants import MUTANTS, Mutant, MutantAdapter
 from conformance.mutants.trial import on_the_mutant, on_the_reference
 from spec import Edition, editions
@@ -59,15 +59,41 @@ def telling_checks(checks: Iterable[Check]) -> list[Check]:
     return [check for check in checks if not told.isdisjoint(check.requirements) and GRADIENTS.isdisjoint(check.uses)]
 
 
-def judge(check: Check, adapter: object, edition: Edition, dtype: str, seed: int = 0, examples: int = 25, shrink: bool = True) -> Result:
-    """Runs one check as the edition has it; with the status "not in edition" where that is not known."""
+def judge(
+    check: Check,
+    adapter: object,
+    edition: Edition,
+    dtype: str,
+    seed: int = 0,
+    examples: int = 25,
+    shrink: bool = True,
+    ordinary: bool = False,
+) -> Result:
+    """Runs one check as the edition has it; with the status "not in edition" where that is not known.
+
+    ordinary: deviations with extreme input do not count.
+    """
     if lacking := missing(adapter, check):
         return not_offered(check, lacking)
     if reason := _unknown(check, edition.name, dtype, seed, examples):
         return Result(check, NOT_JUDGED, Worst(), 0, reason)
     if _holds(check, edition.name, dtype, seed, examples):
-        return run_check(check, adapter, dtype, edition.profile, seed, examples, shrink)
-    return finish(check, _ComparedRun(adapter, edition, dtype, seed, examples, shrink))
+        return finish(check, Run(adapter, dtype, edition.profile, seed, examples, shrink, NumpyAdapter() if ordinary else None))
+    return finish(check, _ComparedRun(adapter, edition, dtype, seed, examples, shrink, ordinary))
+
+
+def judge_twice(check: Check, adapter: object, edition: Edition, dtype: str, seed: int = 0, examples: int = 25) -> Result:
+    """`judge`; where the check fails, it is run again to see whether it fails with ordinary input, too."""
+    result = judge(check, adapter, edition, dtype, seed, examples)
+    if result.status not in FAILING:
+        return result
+    again = judge(check, adapter, edition, dtype, seed, examples, shrink=False, ordinary=True)
+    return dataclasses.replace(result, extreme=again.status == "pass")
+
+
+def by_comparison(result: Result, edition: Edition, settings: Settings) -> bool:
+    """Whether a check was compared with the edition's own reference, of which the catalogue of mutants says nothing."""
+    return not _holds(result.check, edition.name, settings.dtype, settings.seed, settings.examples)
 
 
 @functools.cache
@@ -118,11 +144,11 @@ def _stand_in(check: Check, dtype: str) -> tuple[Check, str]:
 class _ComparedRun(Run):
     """A check of whose calls every one is compared with the edition's reference. What the check itself expects does not count."""
 
-    def __init__(self, adapter: object, edition: Edition, dtype: str, seed: int, examples: int, shrink: bool) -> None:
-        super().__init__(adapter, dtype, edition.profile, seed, examples, shrink)
+    def __init__(self, adapter: object, edition: Edition, dtype: str, seed: int, examples: int, shrink: bool, ordinary: bool) -> None:
         mutant = own_reference(edition.name)
         assert mutant is not None
         self._right = MutantAdapter(mutant)
+        super().__init__(adapter, dtype, edition.profile, seed, examples, shrink, self._right if ordinary else None)
         self._counts = False
 
     def call(self, function: str, *args: Any) -> Any:
@@ -197,7 +223,7 @@ class Fit:
 
 
 def fit(checks: Iterable[Check], adapter: object, dtype: str, seed: int = 0, examples: int = FIT_EXAMPLES) -> list[Fit]:
-    """How the candidate does in each edition, those that are preferred first.
+    """How the candidate does in each edition with ordinary input, those that are preferred first.
 
     A candidate that raises in one edition is not asked again in the others: it would tell nothing, and may be slow to come back.
     """
@@ -209,7 +235,8 @@ def fit(checks: Iterable[Check], adapter: object, dtype: str, seed: int = 0, exa
         for name, statuses in found.items():
             known = _unknown(check, name, dtype, seed, examples)
             status = NOT_JUDGED if known else "error" if broken else ""
-            statuses[check.name] = status or judge(check, adapter, editions()[name], dtype, seed, examples, shrink=False).status
+            status = status or judge(check, adapter, editions()[name], dtype, seed, examples, shrink=False, ordinary=True).status
+            statuses[check.name] = status
             broken |= statuses[check.name] == "error"
     return [Fit(name, statuses) for name, statuses in found.items()]
 

@@ -7,14 +7,18 @@ from collections.abc import Iterable
 
 from conformance.check import CHECKS, Call, CandidateLost, Check, Deviation, Run, Worst
 from conformance.requirements import requirements
+from conformance.strategies import ordinary_numbers
 from spec import editions
+
+FAILING = ("fail", "error")
 
 
 @dataclasses.dataclass(frozen=True)
 class Result:
     """What one check found. status: "pass", "fail", "error" (the candidate raised), "not offered" or "not in edition" (not judged).
 
-    call: where it failed, the last call of the candidate; None where it was not called.
+    call: where it failed, the last call of the candidate; None where it was not called. extreme: whether it fails with extreme input
+    only, and passes with ordinary input.
     """
 
     check: Check
@@ -23,6 +27,7 @@ class Result:
     compared: int
     message: str = ""
     call: Call | None = None
+    extreme: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,7 +89,8 @@ def run_check(check: Check, adapter: object, dtype: str, profile: str, seed: int
 def finish(check: Check, run: Run) -> Result:
     """Runs a check to its end or to its first deviation."""
     try:
-        check.body(run)
+        with ordinary_numbers(run.stand_in is not None):
+            check.body(run)
     except Deviation as deviation:
         return Result(check, "fail", run.worst, run.compared, str(deviation), run.last_call)
     except CandidateLost as lost:

@@ -33,6 +33,9 @@ HOLD_LATENTS = (
 class ForeignAdapter(abc.ABC):
     """An adapter that somebody else wrote. Subclasses say what is offered and how it is called, and give results of `to_numpy`."""
 
+    refuses_anyhow = True
+    """What must be refused may end in an exception of any kind: nobody told its authors which."""
+
     @abc.abstractmethod
     def offers(self, name: str) -> bool:
         """Whether the implementation has a function of this name."""

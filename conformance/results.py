@@ -12,14 +12,13 @@ from pathlib import Path
 from typing import Any
 
 from conformance.errors import UserError
-from conformance.execute import Result, Row, Settings, rows
+from conformance.execute import FAILING, Result, Row, Settings, rows
 from conformance.expected import ExpectedFailures
 from conformance.foreign import ForeignAdapter
 from conformance.reports.reproduce import failure
 from conformance.requirements import chapter_of, requirements
 
 FORMAT = 1
-FAILING = ("fail", "error")
 
 Data = dict[str, Any]
 
@@ -110,6 +109,7 @@ def _check(result: Result, settings: Settings, expected: ExpectedFailures) -> Da
         "share": finite(result.worst.share),
         "where": result.worst.where,
         "message": result.message,
+        "extreme": result.extreme,
         "expected_failure": expected.reason(check),
         "failure": failure(result, settings) if result.status in FAILING else None,
     }

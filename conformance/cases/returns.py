@@ -63,9 +63,10 @@ def lambda_return_ignores_the_start(run: Run) -> None:
 def weights_literals(run: Run) -> None:
     """Weights are 1, gamma, gamma^2, ... without ends; a certain end silences all that follows; the last continue is not used."""
     run.expect("cumulative_weights", (np.ones((1, 4)), GAMMA), np.array([[1, GAMMA, GAMMA**2]]), bound=16 * run.u)
-    continue_ = np.array([[1, 1, 0, 1, 1], [0, 1, 1, 1, 1], [0.5, 0.5, 1, 1, np.nan]])
+    continue_ = np.array([[1, 1, 0, 1, 1], [0, 1, 1, 1, 1], [0.5, 0.5, 1, 1, 0]])
     expected = np.array([[1, 0.5, 0, 0], [0, 0, 0, 0], [0.5, 0.125, 0.0625, 0.03125]])
     run.exact("cumulative_weights", run.call("cumulative_weights", continue_, 0.5), expected)
+    run.exact("the last continue is NaN", run.call("cumulative_weights", np.array([[0.5, 1, np.nan]]), 0.5), np.array([[0.5, 0.25]]))
     run.exact("a discount of 1", run.call("cumulative_weights", np.array([[0.5, 0.5, 1]]), 1.0), np.array([[0.5, 0.25]]))
 
 

@@ -10,12 +10,12 @@ from conformance.adapter import COLUMNS
 from conformance.candidate import candidate, remarks
 from conformance.check import DTYPES, Check
 from conformance.diagnosis import diagnose
-from conformance.editions import Fit, best, fit, judge, telling_checks, to_json
+from conformance.editions import Fit, best, by_comparison, fit, judge_twice, telling_checks, to_json
 from conformance.errors import UserError
-from conformance.execute import Result, Settings, selected_checks
+from conformance.execute import FAILING, Result, Settings, selected_checks
 from conformance.expected import ExpectedFailures, read_expected
 from conformance.reports import badge, html, junit, markdown, terminal
-from conformance.results import FAILING, Data, identity, result_data, write, write_text
+from conformance.results import Data, identity, result_data, write, write_text
 from spec import editions, find_edition
 
 COLUMN_EDITION = "paper"  # of our own columns, unless another is given: they follow the configuration, so there is nothing to find out
@@ -76,7 +76,7 @@ def main(console: Console, options: argparse.Namespace) -> int:
             **{name: getattr(options, name) for name in ("dtype", "device", "only", "seed", "examples", "at_least")},
         )
         results = list(_run_all(console, checks, adapter, settings))
-        if named and telling_checks(result.check for result in results if result.status in FAILING):
+        if named and telling_checks(result.check for result in results if result.status in FAILING and not result.extreme):
             fits = _fit(console, checks, adapter, options)
         diagnoses = _diagnoses(console, adapter, results, settings)
         choice = "given" if asked else "claimed" if named else "best fit"
@@ -110,11 +110,13 @@ def _run_all(console: Console, checks: list[Check], adapter: object, settings: S
     with console.status("checking") as status:
         for number, check in enumerate(checks, 1):
             status.update(f"{number}/{len(checks)} {check.name}")
-            yield judge(check, adapter, edition, settings.dtype, settings.seed, settings.examples)
+            yield judge_twice(check, adapter, edition, settings.dtype, settings.seed, settings.examples)
 
 
 def _diagnoses(console: Console, adapter: object, results: list[Result], settings: Settings) -> list[Data]:
     """The mistakes that explain failures. What the edition has otherwise is none."""
+    edition = editions()[settings.edition]
+    results = [result for result in results if result.status not in FAILING or not by_comparison(result, edition, settings)]
     with console.status("comparing failures with known mistakes"):
         found = diagnose(adapter, results, settings.dtype, settings.profile, settings.seed, settings.examples)
-    return [diagnosis.to_json() for diagnosis in found if diagnosis.mutant.name not in editions()[settings.edition].mutants]
+    return [diagnosis.to_json() for diagnosis in found if diagnosis.mutant.name not in edition.mutants]

@@ -81,12 +81,26 @@ MUTANTS = (
     Mutant(
         name="weights_without_the_root",
         explanation="the weights leave out the continue of the start state: even a terminal state trains the actor",
-        provenance="NM512/dreamerv3-torch, and TorchRL until issue 4128",
+        provenance="TorchRL until issue 4128",
         violates=("RET-7",),
         fix="Multiply the weights by the continue of the start state.",
         edits={
             "returns.cumulative_weights": {
                 "product = product * (discount * continue_[:, t])": "product = product * (discount * (continue_[:, t] if t else 1.0))"
+            }
+        },
+    ),
+    Mutant(
+        name="weights_one_step_late",
+        explanation="each weight leaves out the state's own continue, so that terminal states train the actor",
+        provenance="NM512/dreamerv3-torch; DI-engine 0.5.3",
+        violates=("RET-7",),
+        fix="Multiply before reading: the weight of state t has the continues of states 0 to t.",
+        edits={
+            "returns.cumulative_weights": {
+                "product = product * (discount * continue_[:, t])\n        weights[:, t] = product / discount": (
+                    "weights[:, t] = product\n        product = product * (discount * continue_[:, t])"
+                )
             }
         },
     ),

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from conformance.check import relative_deviation
+from conformance.check import relative_deviation, scale_of
 from conformance.errors import UserError
 from conformance.vectors.format import FORMAT, Table, read_npz
 
@@ -87,6 +87,6 @@ def _deviation(case: Case, result: Mapping[str, Any], actual: Any, dtype: str) -
     if actual.shape != expected.shape:
         return f"{where}: expected shape {expected.shape}, got {actual.shape}"
     magnitude = None if scale == "expected" else case.table.decode(scale, dtype)
-    largest = float(relative_deviation(actual, expected, magnitude, case.floor[dtype]).max(initial=0.0))
+    largest = float(relative_deviation(actual, expected, scale_of(expected, magnitude, case.floor[dtype])).max(initial=0.0))
     tolerance = result["tolerance"][dtype]
     return f"{where}: off by {largest:.3g}, allowed {tolerance:.3g}" if largest > tolerance else ""

@@ -16,7 +16,7 @@ import numpy as np
 
 from conformance.adapter import INTERFACE, OBJECTS
 from conformance.adapters.numpy_adapter import NumpyAdapter
-from conformance.check import BOUND, DTYPES, EPSILON, Check, Run, relative_deviation, round_to
+from conformance.check import BOUND, DTYPES, EPSILON, Check, Run, relative_deviation, round_to, scale_of
 from conformance.execute import missing
 from spec import Config
 
@@ -60,7 +60,7 @@ class _Comparison:
 
     def rejects(self, result: np.ndarray) -> bool:
         """Whether the check does not accept the reference's own result: it asks for rounding that the reference does not do."""
-        return bool(np.any(relative_deviation(result, self.expected, self.scale, 0.0) > self.bound))
+        return bool(np.any(relative_deviation(result, self.expected, scale_of(self.expected, self.scale, 0.0)) > self.bound))
 
 
 @dataclasses.dataclass(eq=False)
