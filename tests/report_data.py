@@ -66,4 +66,10 @@ def adapter(source: str = ADAPTER) -> ModuleAdapter:
 def make(names: tuple[str, ...] = (PASS, FAIL, ERROR, ABSENT), reasons: Mapping[str, str] | None = None, **changes: Any) -> dict[str, Any]:
     asked = settings(**changes)
     results = [run_check(CHECKS[name], adapter(), "float64", "paper", asked.seed, asked.examples) for name in names]
-    return result_data(asked, {"name": "mine", "version": "1.2", "edition": None, "offered": offered(adapter())}, results, ExpectedFailures(reasons or {}), [DIAGNOSIS])
+    return result_data(
+        asked,
+        {"name": "mine", "version": "1.2", "edition": None, "offered": offered(adapter())},
+        results,
+        ExpectedFailures(reasons or {}),
+        [DIAGNOSIS],
+    )

@@ -164,7 +164,11 @@ def test_the_page_needs_nothing_else(data: dict[str, Any]) -> None:
 
 def test_a_page_of_several(data: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     other = make((PASS, "transforms.symexp_matches"))
-    other |= {"implementation": {"name": "other", "version": "", "edition": "official", "offered": []}, "edition": "2024-12", "choice": "claimed"}
+    other |= {
+        "implementation": {"name": "other", "version": "", "edition": "official", "offered": []},
+        "edition": "2024-12",
+        "choice": "claimed",
+    }
     paths = []
     for name, result in (("a", data), ("b", other)):
         paths.append(str(tmp_path / f"{name}.json"))
