@@ -4,6 +4,7 @@ import dataclasses
 import inspect
 import json
 import re
+import sys
 import types
 from collections import namedtuple
 from pathlib import Path
@@ -25,6 +26,7 @@ from conformance.execute import Result, run_check, selected_checks
 from conformance.foreign import arranged
 from conformance.problems import small_config
 from conformance.serve import load_file, to_numpy
+from impl_torch import world_model
 from spec import Config
 
 TESTS = Path(__file__).resolve().parent
@@ -39,8 +41,8 @@ def module(**functions: Any) -> ModuleAdapter:
     return ModuleAdapter(made, "float64")
 
 
-def run(name: str, adapter: object) -> Result:
-    return run_check(CHECKS[name], adapter, "float64", "paper", examples=5)
+def run(name: str, adapter: object, dtype: str = "float64") -> Result:
+    return run_check(CHECKS[name], adapter, dtype, "paper", examples=5)
 
 
 # --- What comes back ---------------------------------------------------------------------------------------------------------------------
@@ -272,13 +274,24 @@ def blocks(language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", DOCUMENT, re.DOTALL)
 
 
-def test_the_examples_of_the_document_pass() -> None:
-    example, given, draw = blocks("python")
+def mean_kl_losses(posterior: torch.Tensor, prior: torch.Tensor, free_nats: float, unimix: float) -> tuple[torch.Tensor, torch.Tensor]:
+    config = dataclasses.replace(CONFIG, free_nats=free_nats, latent_unimix=unimix)
+    return tuple(loss.mean() for loss in world_model.kl_losses(posterior, prior, config))
+
+
+def test_the_examples_of_the_document_pass(monkeypatch: pytest.MonkeyPatch) -> None:
+    example, means, given, draw = blocks("python")
     mine = types.ModuleType("example")
     exec(example, vars(mine))
     adapter = ModuleAdapter(mine, "float64")
     for name in ("transforms.symlog_matches", "returns.lambda_return_matches", "layers.rms_norm_matches"):
         assert run(name, adapter).status == "pass", name
+    averaging = types.ModuleType("averaging")
+    monkeypatch.setitem(sys.modules, "my_code", types.SimpleNamespace(kl_losses=mean_kl_losses))
+    exec(means, vars(averaging))
+    assert run("world_model.kl_matches", ModuleAdapter(averaging, "float64"), "float32").status == "pass"
+    assert averaging.convert(np.ones(2)).dtype == torch.float32
+    assert averaging.convert(np.array([True])).dtype == torch.bool
     drawing = types.ModuleType("drawing")
     exec(draw, vars(drawing))
     assert run("sampling.normals_have_their_distribution", ModuleAdapter(drawing, "float64")).status == "pass"

@@ -67,7 +67,7 @@ def test_the_skeleton_names_what_a_function_reads_of_the_configuration(monkeypat
 
     monkeypatch.setattr(Config, "__getattribute__", noted)
     for check in selected_checks("float64"):
-        if set(check.uses) & set(CONFIG_FIELDS) and check.level < 3:
+        if set(check.uses) & set(CONFIG_FIELDS):
             run_check(check, Noting(), "float64", "paper", examples=1, shrink=False)
     for name, fields in CONFIG_FIELDS.items():
         assert set(fields) <= reads[name], name
