@@ -47,7 +47,7 @@ def render(results: Sequence[Data], origins: Sequence[str] = ()) -> str:
         *(_failures(data, position, name) for position, (data, name) in enumerate(named)),
         *(_expected(data, position, name) for position, (data, name) in enumerate(named)),
         "<h2>Requirements</h2>",
-        f'<p class="small muted">{summary.SCALE} An empty cell: not run.</p>',
+        f'<p class="small muted">{summary.SCALE} Such a failure stands without a number. An empty cell: not run.</p>',
         _matrix(results, names),
     ]
     return "\n".join(["<!doctype html>", '<html lang="en-GB"><head>', *head, "</head><body>", *filter(None, body), "</body></html>"]) + "\n"

@@ -36,7 +36,7 @@ th { font-weight: 600; } thead th { color: var(--muted); }
 .matrix { width: 100%; } .matrix tbody th { white-space: nowrap; }
 .matrix .cell { padding: .25rem .6rem; border-left: 3px solid var(--paper); width: 9rem; min-width: 6.5rem; overflow-wrap: anywhere; }
 .overview { width: auto; } .overview .cell { width: auto; min-width: 9rem; max-width: 32rem; }
-.matrix .text { color: var(--muted); font-size: .85rem; min-width: 15rem; overflow-wrap: anywhere; }
+.matrix .text { color: var(--muted); font-size: .85rem; min-width: 15rem; padding-left: .8rem; overflow-wrap: anywhere; }
 .cell.pass { background: var(--good-back); color: var(--good); }
 .cell.fail { background: var(--bad-back); color: var(--bad); font-weight: 600; }
 .cell.known { background: var(--known-back); color: var(--known); } .cell.none { color: var(--muted); }

@@ -19,7 +19,7 @@ STATUSES = ("pass", "fail", "error", EXTREME, "expected failure", "partly offere
 """As told: a failure may be only with extreme input, or expected; of a requirement, some checks may be offered and others not."""
 UNMEASURED = "not measurable"
 SCALE = (
-    "Worst, of allowed: the worst deviation as a share of the allowed one; 100% is the limit, and 20× is twenty times as much. "
+    "The worst deviation, as a share of the allowed one: 100% is the limit, and 20× is twenty times as much. "
     f"{UNMEASURED.capitalize()}: an exception, NaN, a wrong shape, a condition that does not hold, or unequal numbers that must be equal."
 )
 
