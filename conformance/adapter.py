@@ -40,8 +40,29 @@ class Adapter(Protocol):
     def categorical_log_prob(self, log_probs: Array, onehot: Array) -> Array: ...
     def categorical_entropy(self, log_probs: Array) -> Array: ...
     def categorical_kl(self, log_probs_p: Array, log_probs_q: Array) -> Array: ...
-    def symexp_twohot_loss(self, logits: Array, target: Array, bins: Array) -> Array: ...
-    def symexp_twohot_mean(self, logits: Array, bins: Array) -> Array: ...
+    def symexp_twohot_loss(self, logits: Array, target: Array, bins: Array) -> Array:
+        """Cross-entropy towards the two-hot encoding of a number.
+
+        Args:
+          logits: [..., K]; K varies.
+          target: [...], raw, not passed through symlog.
+          bins: [K], the raw positions, which symexp has spaced. Code of the edition 2023 takes symlog of them.
+
+        Returns:
+          [...], in nats.
+        """
+
+    def symexp_twohot_mean(self, logits: Array, bins: Array) -> Array:
+        """The number that a symexp-twohot output predicts.
+
+        Args:
+          logits: [..., K]; K varies.
+          bins: [K], the raw positions, which symexp has spaced. Code of the edition 2023 takes symlog of them.
+
+        Returns:
+          [...], raw, not in symlog space; exactly 0 for equal logits.
+        """
+
     def bernoulli_loss(self, logit: Array, target: Array) -> Array: ...
     def bernoulli_mean(self, logit: Array) -> Array: ...
     def bounded_normal(self, mean: Array, std: Array, min_std: float, max_std: float) -> tuple[Array, Array]: ...
@@ -289,7 +310,7 @@ class Hooks(Protocol):
         """Called once before all checks, with the precision to compute in: "float64", "float32" or "bfloat16"."""
 
     def edition(self) -> str | None:
-        """The edition or profile that the implementation claims to be, for example "official"; None for no claim."""
+        """The edition that the implementation claims to be: "2023", "2024-04", "2024-12" or "paper"; None for no claim."""
 
     def convert(self, array: Array) -> Any:
         """Called on every array before it is handed to a function: `convert = torch.as_tensor`."""
@@ -316,6 +337,38 @@ RESULTS: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("train_step", "train_step_with", "train_step_given"), ("state", "aux")),
 }
 """Functions with several results -> what these are, in their order."""
+
+_CELL = ("blocks", "norm_epsilon")
+_IMAGES = ("cnn_depth", "cnn_multipliers", "cnn_outer", "cnn_sampling", "halvings", "norm_epsilon")
+_POLICY = ("actor_min_std", "actor_max_std", "actor_unimix")
+_LAPROP = ("beta1", "beta2", "laprop_epsilon")
+CONFIG_FIELDS: dict[str, tuple[str, ...]] = {
+    "core": _CELL,
+    "prior": ("prior_layers", "norm_epsilon"),
+    "posterior": ("posterior_layers", "norm_epsilon"),
+    "observe": ("latent_unimix", "posterior_layers", *_CELL),
+    "imagine": ("latent_unimix", "prior_layers", *_CELL),
+    "observe_given": ("prior_layers", "posterior_layers", *_CELL),
+    "imagine_given": ("prior_layers", *_CELL),
+    "encoder": ("encoder_layers", *_IMAGES),
+    "decoder": ("decoder_layers", "blocks", *_IMAGES),
+    "reward_head": ("reward_layers", "norm_epsilon"),
+    "continue_head": ("continue_layers", "norm_epsilon"),
+    "actor": ("actor_layers", "norm_epsilon"),
+    "critic": ("critic_layers", "norm_epsilon"),
+    "continue_target": ("continue_target", "discount"),
+    "kl_losses": ("free_nats", "latent_unimix"),
+    "reconstruction_losses": ("vector_loss_scale",),
+    "update_return_range": ("return_decay", "return_percentile_low", "return_percentile_high"),
+    **dict.fromkeys(("sample_action", "action_log_prob", "action_entropy", "draw_actions"), _POLICY),
+    "actor_loss": ("entropy_scale",),
+    **dict.fromkeys(("critic_loss", "replay_critic_loss"), ("slow_critic_scale",)),
+    "learning_rate": ("learning_rate", "warmup_steps"),
+    "laprop": _LAPROP,
+    "optimizer_step": ("agc_clip", "agc_epsilon", "learning_rate", "warmup_steps", *_LAPROP),
+    "can_train": ("batch_size", "batch_length", "replay_capacity"),
+}
+"""Functions of one part -> what of the configuration their results depend on, but for sizes, which the shapes show too."""
 
 COLUMNS = ("numpy", "jax", "torch")
 

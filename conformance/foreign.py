@@ -57,7 +57,7 @@ class ForeignAdapter(abc.ABC):
             raise AttributeError(name)
 
         def function(*arguments: Any) -> Any:
-            kinds = zip(arguments, TAKE_ARRAYS[name], strict=True)
+            kinds = zip(arguments, TAKE_ARRAYS[name], strict=False)  # whether the number fits is the candidate's to say
             arguments = tuple(np.asarray(value) if is_array and np.isscalar(value) else value for value, is_array in kinds)
             result = self.call(name, arguments)
             return result if name in OBJECTS else arranged(name, arguments, result)

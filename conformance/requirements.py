@@ -4,12 +4,12 @@ import functools
 import re
 from importlib import resources
 
-_REQUIREMENT = re.compile(r"^- \*\*\[([A-Z]{2,6}-\d+)\]\*\* (.*)$", re.MULTILINE)
+_REQUIREMENT = re.compile(r"^- \*\*\[([A-Z]{2,6}-\d+)\]\*\* (.*(?:\n  .*)*)$", re.MULTILINE)
 
 
 @functools.cache
 def requirements() -> dict[str, str]:
-    """Requirement id -> the first line of its text, in the order of the chapters.
+    """Requirement id -> its text in one line, in the order of the chapters.
 
     Raises:
       ValueError: an id that two requirements share.
@@ -17,10 +17,10 @@ def requirements() -> dict[str, str]:
     found: dict[str, str] = {}
     for chapter in sorted(path.name for path in resources.files("spec").iterdir() if re.match(r"\d\d-.*\.md$", path.name)):
         text = resources.files("spec").joinpath(chapter).read_text(encoding="utf-8")
-        for identifier, line in _REQUIREMENT.findall(text):
+        for identifier, lines in _REQUIREMENT.findall(text):
             if identifier in found:
                 raise ValueError(f"{chapter}: the requirement id {identifier} is used twice")
-            found[identifier] = line
+            found[identifier] = " ".join(lines.split())
     return found
 
 

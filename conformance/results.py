@@ -15,6 +15,7 @@ from conformance.errors import UserError
 from conformance.execute import FAILING, Result, Row, Settings, rows
 from conformance.expected import ExpectedFailures
 from conformance.foreign import ForeignAdapter
+from conformance.offered import offered, unchecked
 from conformance.reports.reproduce import failure
 from conformance.requirements import chapter_of, requirements
 
@@ -36,11 +37,13 @@ def versions() -> dict[str, str]:
 
 
 def identity(adapter: object, candidate: str) -> Data:
-    """Name, version and claimed edition of the candidate. One of our own columns has the version of the kit, and claims none."""
+    """Name, version, claimed edition and functions of the candidate. One of our own columns has the version of the kit, and claims none."""
     if isinstance(adapter, ForeignAdapter):
         claimed = adapter.edition()
-        return {"name": adapter.name, "version": adapter.version, "edition": None if claimed is None else str(claimed)}
-    return {"name": candidate, "version": versions().get("dreamer-spec", ""), "edition": None}
+        about = {"name": adapter.name, "version": adapter.version, "edition": None if claimed is None else str(claimed)}
+    else:
+        about = {"name": candidate, "version": versions().get("dreamer-spec", ""), "edition": None}
+    return {**about, "offered": offered(adapter)}
 
 
 def result_data(
@@ -71,6 +74,7 @@ def result_data(
         "choice": choice,
         "fit": fit,
         "implementation": dict(implementation),
+        "unchecked": unchecked(implementation["offered"], results),
         "versions": versions(),
         "verdict": verdict(settings, results, expected),
         "expected_failures": [

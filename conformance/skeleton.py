@@ -4,15 +4,18 @@ import importlib
 import inspect
 import re
 import textwrap
+from collections.abc import Mapping, Sequence
 from importlib import resources
 
-from conformance.adapter import INTERFACE, Adapter, Hooks
+from conformance.adapter import CONFIG_FIELDS, INTERFACE, Adapter, Hooks
 
 HEADER = '''"""An adapter: what `conformance check {name}` calls.
 
 Uncomment what your implementation offers and call your own code in it. Everything is optional. Arrays come in as NumPy, rows first and
 time second; give back arrays of any library. `docs/adapters.md` of dreamer-spec explains the rest. Good first functions: lambda_return,
 kl_losses, symexp_twohot_loss and core, where most mistakes are.
+
+Numbers that come as arguments, and those of `config`, vary from call to call: hand them on, as a number written into the code fails.
 
 In the shapes: B sequences of T steps, N starts of H imagined steps, D memory units, S latents of C classes, A numbers of a flat action.
 `params` is a dict from canonical names (`rssm/gru/kernel`) to arrays: your function brings them into its own layers first.
@@ -24,16 +27,33 @@ ROWS = (
 )
 
 
-def skeleton(name: str) -> str:
-    """The source of a module that offers nothing yet, for an adapter with the given file name."""
+FIRST = (
+    *("symlog", "symexp", "unimix_log_probs", "symexp_twohot_loss", "symexp_twohot_mean", "core", "kl_losses", "lambda_return"),
+    *("cumulative_weights", "update_return_range", "return_scale", "actor_loss", "critic_loss"),
+)
+"""Functions to begin with: most code bases have them apart, and most mistakes are in them."""
+
+
+def skeleton(name: str, short: bool = False) -> str:
+    """The source of a module that offers nothing yet, for an adapter of that file name. short: it describes only the FIRST functions."""
     parts = [
         HEADER.format(name=name),
         _title("what is not part of the algorithm"),
         *(_commented(hook, getattr(Hooks, hook)) for hook in HOOKS),
     ]
-    for row, functions in functions_by_row().items():
-        parts += [_title(f"{row.replace('_', ' ')}: spec/{chapter(row)}"), *(_commented(name, described(name)) for name in functions)]
-    return "\n".join(parts)
+    rows = functions_by_row()
+    for row, functions in rows.items():
+        if chosen := [name for name in functions if name in FIRST or not short]:
+            parts += [_title(f"{row.replace('_', ' ')}: spec/{chapter(row)}"), *(_commented(name, described(name)) for name in chosen)]
+    return "\n".join([*parts, *([_others(rows)] if short else [])])
+
+
+def _others(rows: Mapping[str, Sequence[str]]) -> str:
+    """A comment that names the functions which are not among the FIRST."""
+    title = _title("what else can be offered: `conformance new-adapter` without --short describes it")
+    lines = (f"{row.replace('_', ' ')}: {', '.join(name for name in functions if name not in FIRST)}" for row, functions in rows.items())
+    wrapped = (textwrap.fill(line, 100, initial_indent="# ", subsequent_indent="#   ", break_on_hyphens=False) for line in lines)
+    return title + "\n" + "\n".join(wrapped) + "\n"
 
 
 HOOKS = tuple(name for name, hook in vars(Hooks).items() if inspect.isfunction(hook) and not name.startswith("_"))
@@ -75,14 +95,21 @@ def _title(text: str) -> str:
 def _commented(name: str, documented: object) -> str:
     function = getattr(Hooks, name) if name in HOOKS else getattr(Adapter, name)
     arguments = ", ".join(list(inspect.signature(function).parameters)[1:])
-    source = f"def {name}({arguments}):\n{textwrap.indent(_brief(documented), '    ')}\n    raise NotImplementedError\n"
+    docstring = _brief(documented, CONFIG_FIELDS.get(name, ()))
+    source = f"def {name}({arguments}):\n{textwrap.indent(docstring, '    ')}\n    raise NotImplementedError\n"
     return "".join(f"# {line}".rstrip() + "\n" for line in source.splitlines())
 
 
-def _brief(documented: object) -> str:
-    """The docstring of a function: its first sentence, arguments and results, without requirement ids and sources."""
+def _brief(documented: object, fields: Sequence[str]) -> str:
+    """The docstring of a function: its first sentence, arguments and results, without requirement ids and sources.
+
+    fields: of the configuration, which its arguments end with.
+    """
     first, *rest = (inspect.getdoc(documented) or "").split("\n\n")
     sections = [section for section in rest if section.startswith(("Args:", "Returns:"))]
+    if fields:
+        config = textwrap.fill(f"config: {', '.join(fields)}.", 100, initial_indent="  ", subsequent_indent="    ")
+        sections = [f"{section}\n{config}" if section.startswith("Args:") else section for section in sections]
     meaning = re.sub(r"\s+", " ", re.sub(r"Implements \[.*?\](?:(?:, | to | and )\[.*?\])*[^.\[]*\.?", "", first, flags=re.DOTALL)).strip()
     text = "\n\n".join([meaning, *sections])
     return f'"""{text}\n"""' if sections else f'"""{text}"""'

@@ -7,6 +7,7 @@ from typing import Any
 from conformance.candidate import ModuleAdapter
 from conformance.execute import Settings, run_check, selected_checks
 from conformance.expected import ExpectedFailures
+from conformance.offered import offered
 from conformance.results import result_data
 
 CHECKS = {check.name: check for check in selected_checks("float64")}
@@ -65,4 +66,10 @@ def adapter(source: str = ADAPTER) -> ModuleAdapter:
 def make(names: tuple[str, ...] = (PASS, FAIL, ERROR, ABSENT), reasons: Mapping[str, str] | None = None, **changes: Any) -> dict[str, Any]:
     asked = settings(**changes)
     results = [run_check(CHECKS[name], adapter(), "float64", "paper", asked.seed, asked.examples) for name in names]
-    return result_data(asked, {"name": "mine", "version": "1.2", "edition": None}, results, ExpectedFailures(reasons or {}), [DIAGNOSIS])
+    return result_data(
+        asked,
+        {"name": "mine", "version": "1.2", "edition": None, "offered": offered(adapter())},
+        results,
+        ExpectedFailures(reasons or {}),
+        [DIAGNOSIS],
+    )

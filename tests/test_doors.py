@@ -4,6 +4,7 @@ import dataclasses
 import inspect
 import json
 import re
+import sys
 import types
 from collections import namedtuple
 from pathlib import Path
@@ -20,13 +21,12 @@ from conformance.adapters.numpy_adapter import NumpyAdapter
 from conformance.adapters.torch_adapter import TorchAdapter
 from conformance.adapters.without_noise import WithoutNoise
 from conformance.candidate import ModuleAdapter, remarks
-from conformance.cli import main
 from conformance.errors import UserError
 from conformance.execute import Result, run_check, selected_checks
 from conformance.foreign import arranged
 from conformance.problems import small_config
 from conformance.serve import load_file, to_numpy
-from conformance.skeleton import HOOKS, functions_by_row, skeleton
+from impl_torch import world_model
 from spec import Config
 
 TESTS = Path(__file__).resolve().parent
@@ -41,8 +41,8 @@ def module(**functions: Any) -> ModuleAdapter:
     return ModuleAdapter(made, "float64")
 
 
-def run(name: str, adapter: object) -> Result:
-    return run_check(CHECKS[name], adapter, "float64", "paper", examples=5)
+def run(name: str, adapter: object, dtype: str = "float64") -> Result:
+    return run_check(CHECKS[name], adapter, dtype, "paper", examples=5)
 
 
 # --- What comes back ---------------------------------------------------------------------------------------------------------------------
@@ -267,56 +267,31 @@ def test_a_mistake_of_the_stranger_is_found() -> None:
     assert run("returns.lambda_return_matches", ModuleAdapter(stranger, "float64")).status == "fail"
 
 
-# --- The skeleton and the document -------------------------------------------------------------------------------------------------------
-
-
-def test_the_skeleton_offers_nothing_and_uncommented_everything() -> None:
-    source = skeleton("mine.py")
-    empty: dict[str, Any] = {}
-    exec(source, empty)
-    assert not [name for name in empty if name in INTERFACE]
-    full: dict[str, Any] = {}
-    exec(re.sub(r"^#(?! ---) ?", "", source, flags=re.MULTILINE), full)
-    assert {name for name in full if callable(full[name])} == {*INTERFACE, *HOOKS}
-    for name, arguments in INTERFACE.items():
-        assert tuple(inspect.signature(full[name]).parameters) == arguments
-        assert len(str(full[name].__doc__)) > 20, name
-        assert not re.search(r"\[[A-Z]{2,5}-\d+\]|Implements", full[name].__doc__), name
-
-
-def test_the_skeleton_is_grouped_by_chapter() -> None:
-    rows = functions_by_row()
-    assert [name for functions in rows.values() for name in functions] == list(INTERFACE)
-    assert rows["returns"][0] == "lambda_return"
-    assert rows["rssm"][-2:] == ["observe_given", "imagine_given"]
-    assert {"gradients", "train_step_given", "draw_parameters"} < set(rows["agent"])
-    assert rows["training_loop"][-1] == "derive_seed"
-    assert "# --- returns: spec/07-returns.md ---" in skeleton("mine.py")
-
-
-def test_new_adapter(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert main(["new-adapter"]) == 0
-    assert main(["new-adapter"]) == 2
-    assert "my_adapter.py exists; give another name" in capsys.readouterr().err
-    assert main(["new-adapter", "absent/mine.py"]) == 2
-    assert "cannot write absent/mine.py" in capsys.readouterr().err
-    assert (tmp_path / "my_adapter.py").read_text(encoding="utf-8") == skeleton("my_adapter.py")
-    assert main(["check", "my_adapter.py", "--only", "symlog"]) == 1  # nothing passes, as nothing is offered
-    assert "not offered" in capsys.readouterr().out
+# --- The document -------------------------------------------------------------------------------------------------------
 
 
 def blocks(language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", DOCUMENT, re.DOTALL)
 
 
-def test_the_examples_of_the_document_pass() -> None:
-    example, given, draw = blocks("python")
+def mean_kl_losses(posterior: torch.Tensor, prior: torch.Tensor, free_nats: float, unimix: float) -> tuple[torch.Tensor, torch.Tensor]:
+    config = dataclasses.replace(CONFIG, free_nats=free_nats, latent_unimix=unimix)
+    return tuple(loss.mean() for loss in world_model.kl_losses(posterior, prior, config))
+
+
+def test_the_examples_of_the_document_pass(monkeypatch: pytest.MonkeyPatch) -> None:
+    example, means, given, draw = blocks("python")
     mine = types.ModuleType("example")
     exec(example, vars(mine))
     adapter = ModuleAdapter(mine, "float64")
     for name in ("transforms.symlog_matches", "returns.lambda_return_matches", "layers.rms_norm_matches"):
         assert run(name, adapter).status == "pass", name
+    averaging = types.ModuleType("averaging")
+    monkeypatch.setitem(sys.modules, "my_code", types.SimpleNamespace(kl_losses=mean_kl_losses))
+    exec(means, vars(averaging))
+    assert run("world_model.kl_matches", ModuleAdapter(averaging, "float64"), "float32").status == "pass"
+    assert averaging.convert(np.ones(2)).dtype == torch.float32
+    assert averaging.convert(np.array([True])).dtype == torch.bool
     drawing = types.ModuleType("drawing")
     exec(draw, vars(drawing))
     assert run("sampling.normals_have_their_distribution", ModuleAdapter(drawing, "float64")).status == "pass"

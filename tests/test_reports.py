@@ -10,11 +10,14 @@ from typing import Any
 from xml.etree import ElementTree
 
 import pytest
-from report_data import ABSENT, ERROR, FAIL, HOSTILE, PASS, make
+from report_data import ABSENT, CHECKS, ERROR, FAIL, HOSTILE, PASS, adapter, make
 from rich.console import Console
 
 from conformance.cli import main
-from conformance.reports import badge, html, junit, markdown, summary, terminal
+from conformance.execute import run_check
+from conformance.offered import offered, unchecked
+from conformance.reports import badge, html, junit, markdown, summary, terminal, tex
+from conformance.requirements import requirements
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +52,7 @@ def shown(data: Mapping[str, Any]) -> str:
 
 
 def test_shares() -> None:
-    shares = {None: "no number", 0.0: "0%", 0.344: "34%", 9.5: "950%", 123.4: "123×", 3.21e14: "3e14×"}
+    shares = {None: "not measurable", 0.0: "0%", 0.344: "34%", 9.5: "950%", 123.4: "123×", 3.21e14: "3e14×"}
     assert {share: summary.percent(share) for share in shares} == shares
 
 
@@ -63,18 +66,22 @@ def test_a_run_prints_its_seed_and_version(data: dict[str, Any]) -> None:
 
 def test_the_terminal(data: dict[str, Any]) -> None:
     text = shown(data)
-    assert "failed: 2 checks failed" in text
+    assert "failed: 2 checks fail\n" in text
     assert "4 checks, " in text
     assert "1 pass, 1 fail, 1 error, 1 not offered" in text
     assert "behaves like return_bootstraps_from_itself" in text
+    assert "known from: the paper's printed indices" in text
     assert "RuntimeError: out of order" in text
     assert data["checks"][FAIL]["failure"]["command"] in text
-    assert len(text.splitlines()) < 50
+    assert "  lambda_return, called with\n    reward = [[9.0, 1.0, 0.0, 2.0]]\n" in text
+    assert "--html" not in text
+    assert len(text.splitlines()) < 65
 
 
 def test_markdown(data: dict[str, Any]) -> None:
     text = markdown.render(data)
-    assert text.startswith("# Conformance of mine 1.2\n\n**Failed: 2 checks failed.**")
+    assert text.startswith("# Conformance of mine 1.2\n\n**Failed: 2 checks fail.**")
+    assert "Known from: the paper's printed indices." in text
     assert "- **return\\_bootstraps\\_from\\_itself**" in text
     assert f"```python\n{data['checks'][FAIL]['failure']['snippet']}\n```" in text
     assert "| `reward` | float64 \\[1, 4\\] | `[[9.0, 1.0, 0.0, 2.0]]` |" in text
@@ -164,15 +171,19 @@ def test_the_page_needs_nothing_else(data: dict[str, Any]) -> None:
 
 def test_a_page_of_several(data: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     other = make((PASS, "transforms.symexp_matches"))
-    other |= {"implementation": {"name": "other", "version": "", "edition": "official"}, "edition": "2024-12", "choice": "claimed"}
+    other |= {
+        "implementation": {"name": "other", "version": "", "edition": "official", "offered": []},
+        "edition": "2024-12",
+        "choice": "claimed",
+    }
     paths = []
     for name, result in (("a", data), ("b", other)):
         paths.append(str(tmp_path / f"{name}.json"))
         Path(paths[-1]).write_text(json.dumps(result), encoding="utf-8")
     assert main(["report", *paths, "--out", str(tmp_path / "page.html")]) == 0
     document = Document((tmp_path / "page.html").read_text(encoding="utf-8"))
-    assert "Failures of mine 1.2" in document.text
-    assert "Failures of other" not in document.text
+    assert "Failures: mine 1.2" in document.text
+    assert "Failures: other" not in document.text
     assert "Judged as the edition 2024-12 (the authors' code since December 2024), as it claims." in document.text
     assert main(["report", str(tmp_path / "page.html")]) == 2
     assert capsys.readouterr().err.startswith("conformance: error: ")
@@ -182,6 +193,95 @@ def test_two_runs_of_one_implementation_are_told_apart(data: dict[str, Any]) -> 
     text = Document(html.render([data, {**data, "dtype": "float32"}])).text
     assert "mine 1.2 float64, paper" in text
     assert "mine 1.2 float32, paper" in text
+
+
+def test_what_is_alike_in_several_results_is_told_apart(data: dict[str, Any]) -> None:
+    other = {**data, "implementation": {**data["implementation"], "version": "1.3"}}
+    paper, half = {**data, "edition": "paper"}, {**data, "dtype": "float32"}
+    assert summary.names([paper, other], ["a", "b"]) == ["mine 1.2", "mine 1.3"]
+    found = summary.names([paper, half, paper, other], ["a", "b", "c", "d"])
+    assert found == ["mine 1.2 float64, paper, a", "mine 1.2 float32, paper", "mine 1.2 float64, paper, c", "mine 1.3"]
+
+
+# --- What fails only with extreme input --------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def extreme(data: dict[str, Any]) -> dict[str, Any]:
+    """The failure that a mistake explains is one with extreme input; the error is none."""
+    return {**data, "checks": {**data["checks"], FAIL: {**data["checks"][FAIL], "extreme": True}}}
+
+
+def test_failures_are_ordered(data: dict[str, Any], extreme: dict[str, Any]) -> None:
+    found = summary.failures(data)
+    assert [name for name, _ in found.ordinary] == [FAIL, ERROR]  # the explained one first
+    assert summary.headline(data) == "failed: 2 checks fail"
+    found = summary.failures(extreme)
+    assert ([name for name, _ in found.ordinary], [name for name, _ in found.extreme]) == ([ERROR], [FAIL])
+    assert summary.headline(extreme) == "failed: 1 check fails, 1 more only with extreme input"
+    assert summary.status(extreme, "RET-1") == "fail at extremes"
+    only = {**extreme, "checks": {FAIL: extreme["checks"][FAIL]}}
+    assert summary.headline(only) == "failed: 1 check fails, only with extreme input"
+    expected = make((FAIL, ERROR), {FAIL: "as printed"}, at_least=9)
+    assert [name for name, _ in summary.failures(expected).expected] == [FAIL]
+    assert summary.problems(expected) == ["1 check fails", "0 checks passed, and at least 9 must"]
+
+
+def test_extreme_failures_come_under_a_heading(extreme: dict[str, Any]) -> None:
+    for text in (shown(extreme), markdown.render(extreme), Document(html.render([extreme])).text):
+        command, heading = extreme["checks"][FAIL]["failure"]["command"], "Only with extreme input"
+        assert text.index(extreme["checks"][ERROR]["failure"]["command"]) < text.index(heading) < text.index(command)
+    boxes = [attributes for _, attributes in Document(html.render([extreme])).elements if "failure-0" in str(attributes.get("id"))]
+    assert {box["id"]: "open" in box for box in boxes} == {f"failure-0-{ERROR}": True, f"failure-0-{FAIL}": False}
+
+
+def test_the_terminal_names_what_it_does_not_show(data: dict[str, Any]) -> None:
+    many = {**data, "checks": {**data["checks"], **{f"layers.copy_{n}": data["checks"][ERROR] for n in range(5)}}}
+    assert "and 2 more: layers.copy_3, layers.copy_4" in shown(many)
+    assert shown(many).endswith("\neverything in full: --html FILE\n")
+
+
+def test_a_traceback_comes_last_and_folded(data: dict[str, Any]) -> None:
+    message = data["checks"][ERROR]["message"]
+    assert message.startswith("Traceback")
+    assert summary.cause(message) == "RuntimeError: out of order"
+    assert summary.cause("a: got 1\n  expected 2\n") == "a: got 1\n  expected 2"
+    page = html.render([data])
+    assert "<pre>RuntimeError: out of order</pre>" in page
+    assert page.index("See it again") < page.index("<details><summary>Traceback</summary><pre>Traceback")
+
+
+# --- What was not judged -----------------------------------------------------------------------------------------------------------------
+
+
+def test_offered_but_not_checked() -> None:
+    made = adapter("def mse_loss(prediction, target): ...\ndef symlog(x): return x")
+    results = [run_check(CHECKS[name], made, "float64", "paper", examples=1) for name in ("distributions.squared_errors_match", PASS)]
+    assert offered(made) == ["symlog", "mse_loss"]
+    assert unchecked(offered(made), results) == [{"function": "mse_loss", "needs": ["symlog_mse_loss"]}]
+    data = {**make(), "unchecked": unchecked(offered(made), results)}
+    line = "Offered but not checked: mse_loss (needs symlog_mse_loss)."
+    assert line in shown(data)
+    assert line in Document(html.render([data])).text
+    assert line.replace("_", "\\_") in markdown.render(data)
+
+
+def test_cells_say_what_was_not_offered(data: dict[str, Any]) -> None:
+    page = html.render([data])
+    assert '<td class="cell fail">1 fail, 1 not offered</td>' in page  # layers: RMSNorm raises, silu is absent
+    assert "<details><summary>1 not offered</summary>" in page
+
+
+def test_formulas_are_plain_text() -> None:
+    text = r"`a$b$` is $16 \delta (1 + \lvert x \rvert)$, $p_{c+j} \ge 10^{-12}$, $\mathrm{sg}(x_0)$ and $\frac{1}{2} \sqrt{n}$"
+    assert tex.plain(text) == "`a$b$` is 16 δ (1 + |x|), p_(c+j) ≥ 10⁻¹², sg(x₀) and 1/2 √n"
+    assert html.prose("**[X-1]** a `b*c*` *d* $e < 2 * f * g$") == "<b>[X-1]</b> a <code>b*c*</code> <i>d</i> e &lt; 2 * f * g"
+
+
+def test_no_requirement_is_cut_or_shows_tex() -> None:
+    for identifier, text in requirements().items():
+        assert text.endswith((".", ".)")), identifier
+        assert not re.search(r"\$|\\[a-z]", re.sub("`[^`]*`", "", tex.plain(text))), identifier
 
 
 def test_chapters_are_linked_where_the_repository_is_known(data: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,6 +15,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(console: Console, options: argparse.Namespace) -> int:
-    write_text(options.out, html.render([read(path) for path in options.results]))
+    write_text(options.out, html.render([read(path) for path in options.results], [str(path) for path in options.results]))
     console.print(f"wrote {options.out}", markup=False, highlight=False)
     return 0

@@ -12,11 +12,12 @@ def render(data: Data) -> str:
         f"# Conformance of {text(summary.label(data))}",
         f"**{text(summary.headline(data)).capitalize()}.**",
         f"{text(summary.settings(data))}, {text(data['date'])}. {text(summary.tally(data))}.",
-        text(" ".join(summary.edition(data))),
+        text(" ".join([*summary.edition(data), summary.unchecked(data)])),
         _chapters(data),
         *_diagnoses(data),
+        *_failures("Failures", summary.failures(data).ordinary),
+        *_failures("Only with extreme input", summary.failures(data).extreme),
         *_expected(data),
-        *(part for name, check in summary.failures(data) for part in _failure(data, name, check)),
     ]
     return "\n\n".join(parts) + "\n"
 
@@ -59,13 +60,14 @@ def _chapters(data: Data) -> str:
     for found in summary.chapters(data):
         counts = ", ".join(f"{found.counts[name]} {name}" for name in summary.STATUSES if found.counts[name])
         rows.append([chapter(found.path), counts, summary.percent(found.share), text(found.where)])
-    return table(["chapter", "requirements", "worst, of allowed", "where"], rows)
+    return f"{table(['chapter', 'requirements', 'worst, of allowed', 'where'], rows)}\n\n{text(summary.SCALE)}"
 
 
 def _diagnoses(data: Data) -> list[str]:
     lines = [
         f"- **{text(found['mutant'])}**: {text(found['explanation'])} See {chapter(found['chapter'])}. {text(found['fix'])} "
         f"Explains {', '.join(map(code, found['explained']))}."
+        + (f" Known from: {text(found['provenance'])}." if found["provenance"] else "")
         for found in data["diagnoses"]
     ]
     return ["## It behaves like", "\n".join(lines)] if lines else []
@@ -73,13 +75,24 @@ def _diagnoses(data: Data) -> list[str]:
 
 def _expected(data: Data) -> list[str]:
     rows = [[code(entry["name"]), entry["outcome"], text(entry["reason"])] for entry in data["expected_failures"]]
-    return ["## Expected failures", table(["name", "outcome", "reason"], rows)] if rows else []
+    if not rows:
+        return []
+    failing = (part for name, check in summary.failures(data).expected for part in _failure(name, check))
+    return ["## Expected failures", table(["name", "outcome", "reason"], rows), *failing]
 
 
-def _failure(data: Data, name: str, check: Data) -> list[str]:
+def _failures(title: str, failing: Sequence[tuple[str, Data]]) -> list[str]:
+    return [f"## {title}", *(part for name, check in failing for part in _failure(name, check))] if failing else []
+
+
+def _failure(name: str, check: Data) -> list[str]:
     failure = check["failure"]
     expected = f" An expected failure: {text(check['expected_failure'])}" if summary.is_expected(check) else ""
-    parts = [f"## {text(name)}", f"{', '.join(check['requirements'])}: {text(check['summary'])}{expected}", block(check["message"], "text")]
+    parts = [
+        f"### {text(name)}",
+        f"{', '.join(check['requirements'])}: {text(check['summary'])}{expected}",
+        block(check["message"], "text"),
+    ]
     rows = [[code(value["name"]), text(value["type"]), code(value["text"]).replace("|", "\\|")] for value in summary.values(failure)]
     if rows:
         parts += [f"The call of {code(failure['function'])}:", table(["", "type", "value"], rows)]

@@ -34,10 +34,9 @@ table { border-collapse: collapse; font-size: .9rem; margin: .4rem 0 1rem; }
 th, td { text-align: left; padding: .25rem .9rem .25rem 0; border-bottom: 1px solid var(--grid); vertical-align: top; }
 th { font-weight: 600; } thead th { color: var(--muted); }
 .matrix { width: 100%; } .matrix tbody th { white-space: nowrap; }
-.matrix .cell { padding: .25rem .6rem; border-left: 3px solid var(--paper); width: 9rem; min-width: 6.5rem; }
-.overview { width: auto; }
-.matrix .text div { display: -webkit-box; -webkit-box-orient: vertical; -webkit-line-clamp: 3; overflow: hidden; }
-.matrix .text { color: var(--muted); font-size: .85rem; min-width: 15rem; overflow-wrap: anywhere; }
+.matrix .cell { padding: .25rem .6rem; border-left: 3px solid var(--paper); width: 9rem; min-width: 6.5rem; overflow-wrap: anywhere; }
+.overview { width: auto; } .overview .cell { width: auto; min-width: 9rem; max-width: 32rem; }
+.matrix .text { color: var(--muted); font-size: .85rem; min-width: 15rem; padding-left: .8rem; overflow-wrap: anywhere; }
 .cell.pass { background: var(--good-back); color: var(--good); }
 .cell.fail { background: var(--bad-back); color: var(--bad); font-weight: 600; }
 .cell.known { background: var(--known-back); color: var(--known); } .cell.none { color: var(--muted); }
@@ -50,7 +49,6 @@ details { margin: .4rem 0; } summary { cursor: pointer; overflow-wrap: anywhere;
 .diagnosis p { margin: .1rem 0; }
 .values td:first-child { white-space: nowrap; } .values td:nth-child(2) { white-space: nowrap; color: var(--muted); font-size: .85rem; }
 @media (max-width: 40rem) { .overview tbody th { white-space: normal; } .overview { width: auto; }
-.matrix .text div { display: -webkit-box; -webkit-box-orient: vertical; -webkit-line-clamp: 3; overflow: hidden; }
 .matrix .text { display: none; } .matrix .cell { min-width: 5.5rem; width: auto; }
   .values, .values tbody, .values tr, .values td { display: block; } .values td { border: 0; padding: 0; }
   .values tr { border-bottom: 1px solid var(--grid); padding: .3rem 0; } .values td:nth-child(2) { white-space: normal; } }

@@ -3,8 +3,9 @@
 import dataclasses
 import functools
 import importlib.metadata
+import itertools
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from typing import Any
 
@@ -13,8 +14,33 @@ from spec import editions
 Data = Mapping[str, Any]
 
 FAILING = ("fail", "error")
-STATUSES = ("pass", "fail", "error", "expected failure", "partly offered", "not offered", "not in edition")
-"""Of a requirement, as told: a failure may be expected, and some of its checks may be offered and others not."""
+EXTREME = "fail at extremes"
+STATUSES = ("pass", "fail", "error", EXTREME, "expected failure", "partly offered", "not offered", "not in edition")
+"""As told: a failure may be only with extreme input, or expected; of a requirement, some checks may be offered and others not."""
+UNMEASURED = "not measurable"
+SCALE = (
+    "The worst deviation, as a share of the allowed one: 100% is the limit, and 20× is twenty times as much. "
+    f"{UNMEASURED.capitalize()}: an exception, NaN, a wrong shape, a condition that does not hold, or unequal numbers that must be equal."
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Failures:
+    """The checks that failed, by name. extreme: only with extreme input. Those that a recognized mistake explains come first in each."""
+
+    ordinary: list[tuple[str, Data]]
+    extreme: list[tuple[str, Data]]
+    expected: list[tuple[str, Data]]
+
+    def __str__(self) -> str:
+        """4 checks fail, 11 more only with extreme input."""
+        ordinary, extreme = len(self.ordinary), len(self.extreme)
+        fail = f"{ordinary or extreme} {'check fails' if (ordinary or extreme) == 1 else 'checks fail'}"
+        return (
+            f"{fail}, {extreme} more only with extreme input"
+            if ordinary and extreme
+            else fail + ", only with extreme input" * (not ordinary)
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,26 +88,38 @@ def status(data: Data, requirement: str) -> str:
     """One of STATUSES."""
     entry = data["requirements"][requirement]
     checks = [data["checks"][name] for name in entry["checks"] if name in data["checks"]]
-    if entry["status"] in FAILING and all(check["expected_failure"] for check in checks if check["status"] in FAILING):
-        return "expected failure"
+    if failing := {told(check) for check in checks if check["status"] in FAILING}:
+        return next(name for name in ("error", "fail", EXTREME, "expected failure") if name in failing)
     if entry["status"] == "not offered" and any(check["status"] == "pass" for check in checks):
         return "partly offered"
     return str(entry["status"])
 
 
 def counts(data: Data) -> Counter[str]:
-    """Checks by status; a failure that is expected counts as such."""
-    return Counter("expected failure" if is_expected(check) else check["status"] for check in data["checks"].values())
+    """Checks by status, as told."""
+    return Counter(map(told, data["checks"].values()))
+
+
+def told(check: Data) -> str:
+    """One of STATUSES: what the status of a check comes to."""
+    if is_expected(check):
+        return "expected failure"
+    return EXTREME if check["extreme"] else str(check["status"])
 
 
 def is_expected(check: Data) -> bool:
     return check["status"] in FAILING and check["expected_failure"] is not None
 
 
-def failures(data: Data) -> Iterator[tuple[str, Data]]:
-    """The checks that failed; those that nobody expected come first."""
+def failures(data: Data) -> Failures:
     failing = [(name, check) for name, check in data["checks"].items() if check["status"] in FAILING]
-    yield from sorted(failing, key=lambda item: is_expected(item[1]))
+    failing.sort(key=lambda item: not matching(data, item[0]))
+    unexpected = [item for item in failing if not is_expected(item[1])]
+    return Failures(
+        ordinary=[item for item in unexpected if not item[1]["extreme"]],
+        extreme=[item for item in unexpected if item[1]["extreme"]],
+        expected=[item for item in failing if is_expected(item[1])],
+    )
 
 
 def judged(data: Data) -> int:
@@ -113,6 +151,26 @@ def label(data: Data) -> str:
     return f"{data['implementation']['name']} {data['implementation']['version']}".strip()
 
 
+def names(results: Sequence[Data], origins: Sequence[str]) -> list[str]:
+    """A name for each of several results: its label, and among equal ones precision and edition, and then the origin."""
+    found = [label(data) for data in results]
+    for parts in ([f" {data['dtype']}, {data['edition']}" for data in results], [f", {origin}" for origin in origins]):
+        shared = Counter(found)
+        found = [name + part * (shared[name] > 1) for name, part in zip(found, parts, strict=True)]
+    return found
+
+
+def cause(message: str) -> str:
+    """Of a traceback the exception, of another message all of it."""
+    _, _, last_frame = message.rpartition('\n  File "')
+    lines = last_frame.splitlines()
+    return (
+        "\n".join(itertools.dropwhile(lambda line: line.startswith(" "), lines[1:]))
+        if message.startswith("Traceback")
+        else message.rstrip()
+    )
+
+
 def settings(data: Data) -> str:
     """What the cases were drawn with, and by which kit: enough to draw them again."""
     kit = data["versions"].get("dreamer-spec")
@@ -126,7 +184,20 @@ def headline(data: Data) -> str:
     number, total = judged(data), len(data["checks"])
     if data["verdict"]["passed"]:
         return f"passed: conforms in what it offers, {number} of {total} checks"
-    return f"failed: {'; '.join(data['verdict']['problems'])}"
+    return f"failed: {'; '.join(problems(data))}"
+
+
+def problems(data: Data) -> list[str]:
+    """What stands against the run, with the failures told apart: the verdict counts them all in its first problem."""
+    found = failures(data)
+    rest = data["verdict"]["problems"]
+    return [str(found), *rest[1:]] if found.ordinary or found.extreme else list(rest)
+
+
+def unchecked(data: Data) -> str:
+    """The functions that are offered and that no check could use: a line, or nothing."""
+    entries = [f"{entry['function']} (needs {', '.join(entry['needs'])})" for entry in data["unchecked"]]
+    return f"Offered but not checked: {', '.join(entries)}." if entries else ""
 
 
 def tally(data: Data) -> str:
@@ -138,9 +209,9 @@ def tally(data: Data) -> str:
 
 
 def percent(share: float | None) -> str:
-    """A share of what is allowed; factors above 10, and nothing where it has no size."""
+    """A share of what is allowed; factors above 10, and words where it has no size: SCALE explains them."""
     if share is None:
-        return "no number"
+        return UNMEASURED
     if share > 10:
         return f"{share:.0f}×" if share < 1e4 else f"{share:.0e}×".replace("e+", "e")
     return f"{share:.0%}"

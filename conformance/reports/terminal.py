@@ -1,6 +1,7 @@
 """The result in a terminal: a line for each chapter, what failed, and the outcome."""
 
 import re
+from collections.abc import Sequence
 from typing import Any
 
 from rich.console import Console
@@ -9,8 +10,9 @@ from rich.table import Table
 
 from conformance.reports import summary
 from conformance.reports.summary import Data
+from conformance.reports.values import brief
 
-STYLE = {"pass": "green", "fail": "bold red", "error": "bold red", "expected failure": "yellow"}
+STYLE = {"pass": "green", "fail": "bold red", "error": "bold red", summary.EXTREME: "yellow", "expected failure": "yellow"}
 SHOWN = 5  # failures in full; the others by name
 LINES = 10  # of one message: the last of a traceback say what happened
 
@@ -18,8 +20,35 @@ LINES = 10  # of one message: the last of a traceback say what happened
 def show(console: Console, data: Data) -> None:
     """Prints it. Control characters of an implementation's messages do nothing."""
     data = _printable(data)
+    _chapters(console, data)
+    for line in (*summary.edition(data), summary.unchecked(data)):
+        if line:
+            _plain(console, line)
+    for diagnosis in data["diagnoses"]:
+        _diagnosis(console, diagnosis)
+    failures = summary.failures(data)
+    _failures(console, failures.ordinary, SHOWN)
+    if failures.extreme:
+        console.print("\n[bold]Only with extreme input[/]", highlight=False)
+        _failures(console, failures.extreme, max(0, SHOWN - len(failures.ordinary)))
+    for entry in data["expected_failures"]:
+        outcome = {"fail": "fails as expected", "pass": "passes, and is expected to fail", "not run": "was not run"}[entry["outcome"]]
+        _plain(console, f"{entry['name']} {outcome}: {entry['reason']}")
+    _plain(console, summary.tally(data))
+    if not summary.judged(data):
+        _plain(console, "nothing was checked: the functions that these checks need are not offered")
+    console.print(f"[{'bold green' if data['verdict']['passed'] else 'bold red'}]{escape(summary.headline(data))}[/]", highlight=False)
+    if len(failures.ordinary) + len(failures.extreme) > SHOWN:
+        _plain(console, "everything in full: --html FILE")
+
+
+def _plain(console: Console, text: str) -> None:
+    console.print(text, markup=False, highlight=False)
+
+
+def _chapters(console: Console, data: Data) -> None:
     title = f"{summary.label(data)}: {summary.settings(data)}"
-    table = Table(title=escape(title), title_justify="left", title_style="")
+    table = Table(title=escape(title), title_justify="left", title_style="", caption=summary.SCALE, caption_justify="left")
     for column in ("chapter", "requirements", "worst, of allowed", "where"):
         table.add_column(column, overflow="fold")
     for chapter in summary.chapters(data):
@@ -29,30 +58,32 @@ def show(console: Console, data: Data) -> None:
     if table.row_count:
         console.print(table)
     else:
-        console.print(title, markup=False, highlight=False)
-    for line in summary.edition(data):
-        console.print(line, markup=False, highlight=False)
-    for diagnosis in data["diagnoses"]:
-        console.print(f"\n[bold]behaves like {escape(diagnosis['mutant'])}[/]: {escape(diagnosis['explanation'])}", highlight=False)
-        console.print(f"  see {diagnosis['chapter']}. {diagnosis['fix']}", markup=False, highlight=False)
-        console.print(f"  explains {', '.join(diagnosis['explained'])}", markup=False, highlight=False)
-        if diagnosis["alternatives"]:
-            console.print(f"  cannot be told from {', '.join(diagnosis['alternatives'])}", markup=False, highlight=False)
-    failing = [(name, check) for name, check in summary.failures(data) if not summary.is_expected(check)]
-    for name, check in failing[:SHOWN]:
+        _plain(console, title)
+
+
+def _diagnosis(console: Console, diagnosis: Data) -> None:
+    console.print(f"\n[bold]behaves like {escape(diagnosis['mutant'])}[/]: {escape(diagnosis['explanation'])}", highlight=False)
+    if diagnosis["provenance"]:
+        _plain(console, f"  known from: {diagnosis['provenance']}")
+    _plain(console, f"  see {diagnosis['chapter']}. {diagnosis['fix']}")
+    _plain(console, f"  explains {', '.join(diagnosis['explained'])}")
+    if diagnosis["alternatives"]:
+        _plain(console, f"  cannot be told from {', '.join(diagnosis['alternatives'])}")
+
+
+def _failures(console: Console, failing: Sequence[tuple[str, Data]], shown: int) -> None:
+    """Some in full, the others by name."""
+    for name, check in failing[:shown]:
         console.print(f"\n[bold red]{name}[/] ({', '.join(check['requirements'])}): {escape(check['summary'])}", highlight=False)
         lines = check["message"].rstrip().splitlines()
-        console.print("\n".join(["..."] * (len(lines) > LINES) + lines[-LINES:]), markup=False, highlight=False)
-        console.print(f"  {check['failure']['command']}", markup=False, highlight=False, soft_wrap=True)
-    if len(failing) > SHOWN:
-        console.print(f"\nand {len(failing) - SHOWN} more: {', '.join(name for name, _ in failing[SHOWN:])}", markup=False, highlight=False)
-    for entry in data["expected_failures"]:
-        outcome = {"fail": "fails as expected", "pass": "passes, and is expected to fail", "not run": "was not run"}[entry["outcome"]]
-        console.print(f"{entry['name']} {outcome}: {entry['reason']}", markup=False, highlight=False)
-    console.print(summary.tally(data), markup=False, highlight=False)
-    if not summary.judged(data):
-        console.print("nothing was checked: the functions that these checks need are not offered", markup=False, highlight=False)
-    console.print(f"[{'bold green' if data['verdict']['passed'] else 'bold red'}]{escape(summary.headline(data))}[/]", highlight=False)
+        _plain(console, "\n".join(["..."] * (len(lines) > LINES) + lines[-LINES:]))
+        failure = check["failure"]
+        if failure["function"]:
+            _plain(console, "\n".join([f"  {failure['function']}, called with", *(f"    {line}" for line in brief(failure["arguments"]))]))
+        console.print(f"  {failure['command']}", markup=False, highlight=False, soft_wrap=True)
+    if len(failing) > shown:
+        number = f"and {len(failing) - shown} more" if shown else f"{len(failing)}"
+        _plain(console, f"\n{number}: {', '.join(name for name, _ in failing[shown:])}")
 
 
 def _printable(value: Any) -> Any:

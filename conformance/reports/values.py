@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ WRITTEN_OUT = 128  # a call with so many numbers in all is written out as source
 LEAVES = 12  # a nested argument of so many arrays is shown array by array
 NEIGHBOURS = 2  # of the worst element, on each side along the last axis
 FIRST = 5
+BRIEF = 8  # values of a call in a terminal
 WIDTH = 100
 
 
@@ -70,6 +71,16 @@ def _extent(array: np.ndarray) -> str:
     sizes += [f"{bad} not finite"] if bad else []
     first = ", ".join(number(value) for value in array.flat[:FIRST])
     return f"{', '.join(sizes)}\nthe first: {first}, ..."
+
+
+def brief(entries: Sequence[Mapping[str, Any]]) -> list[str]:
+    """A line for each value of `shown`: the value itself where it fits into two lines, else its type. After BRIEF lines, dots."""
+    lines = []
+    for entry in entries[:BRIEF]:
+        text = " ".join(entry["text"].split())
+        is_small = entry["whole"] and len(text) <= 2 * WIDTH
+        lines.append(f"{entry['name']} = {text}" if is_small else f"{entry['name']}: {entry['type']}")
+    return lines + ["..."] * (len(entries) > BRIEF)
 
 
 def number(value: Any) -> str:
