@@ -35,7 +35,7 @@ def reduce(name: str, result: Data) -> Data:
         "door": "process" if result["process"] else "module",
         **{key: result[key] for key in ("dtype", "edition", "choice", "seed", "examples", "versions")},
         "checks": {
-            check: {key: entry[key] for key in ("status", "requirements", "compared")}
+            check: {key: entry[key] for key in ("status", "requirements", "compared", "extreme")}
             | ({"message": _brief(entry)} if entry["status"] in FAILING else {})
             for check, entry in offered.items()
         },
@@ -80,10 +80,11 @@ def summary_table() -> str:
     for name, result in strangers().items():
         package, failed = findings()[name], failing(result)
         kinds = [kind_of(package, check) for check in failed]
-        counts = [len(result["checks"]), len(result["checks"]) - len(failed), *(kinds.count(kind) for kind in KINDS)]
+        extreme = sum(result["checks"][check]["extreme"] for check in failed)
+        counts = [len(result["checks"]), len(result["checks"]) - len(failed), extreme, *(kinds.count(kind) for kind in KINDS)]
         setting = f"{result['dtype']}, {result['edition']}"
         rows.append([f"[{package['title']}]({package['url']})", result["version"], result["date"], setting, *map(str, counts)])
-    return _table(["package", "version", "checked on", "precision, edition", "checks judged", "passed", *KINDS.values()], rows)
+    return _table(["package", "version", "checked on", "precision, edition", "checks judged", "passed", "fail at extremes only", *KINDS.values()], rows)
 
 
 def finding_sections() -> str:
@@ -100,7 +101,8 @@ def _section(package: Data, result: Data) -> str:
         others = [other for other in failed if package[other].get("same") == check]
         names = ", ".join(f"`{name}`" for name in (check, *others))
         requirements = ", ".join(sorted({id_ for name in (check, *others) for id_ in result["checks"][name]["requirements"]}))
-        lines += ["", f"**{names}** ({requirements}): {KINDS[finding['kind']]}.", "", f"> {result['checks'][check]['message']}"]
+        at = ", with extreme input only" if all(result["checks"][name]["extreme"] for name in (check, *others)) else ""
+        lines += ["", f"**{names}** ({requirements}): {KINDS[finding['kind']]}{at}.", "", f"> {result['checks'][check]['message']}"]
         lines += ["", finding["what"].strip(), "", f"Verified: {finding['verified'].strip()}"]
         if "script" in finding:
             lines += ["", "```python", finding["script"].strip(), "```"]

@@ -98,7 +98,7 @@ def test_the_calculations_by_hand(package: str, script: str) -> None:
 
 
 def test_a_result_is_reduced_to_what_is_shown() -> None:
-    passed: dict[str, Any] = {"status": "pass", "requirements": ["TRA-3"], "compared": 7, "message": "", "level": 0}
+    passed: dict[str, Any] = {"status": "pass", "requirements": ["TRA-3"], "compared": 7, "message": "", "level": 0, "extreme": False}
     error = "Traceback (most recent call last):\n  File x\nTypeError: no\n--------------------\nFor simplicity, JAX has removed frames."
     result = {
         **{"date": "2026-01-31", "process": False, "dtype": "float64", "edition": "paper", "seed": 0, "examples": 25, "versions": {}},
@@ -113,9 +113,9 @@ def test_a_result_is_reduced_to_what_is_shown() -> None:
     }
     kept = reduce("theirs", result)
     assert kept["checks"] == {
-        "good": {"status": "pass", "requirements": ["TRA-3"], "compared": 7},
-        "bad": {"status": "fail", "requirements": ["TRA-3"], "compared": 7, "message": "got 1, expected 2"},
-        "raised": {"status": "error", "requirements": ["TRA-3"], "compared": 7, "message": "TypeError: no"},
+        "good": {"status": "pass", "requirements": ["TRA-3"], "compared": 7, "extreme": False},
+        "bad": {"status": "fail", "requirements": ["TRA-3"], "compared": 7, "extreme": False, "message": "got 1, expected 2"},
+        "raised": {"status": "error", "requirements": ["TRA-3"], "compared": 7, "extreme": False, "message": "TypeError: no"},
     }
     assert (kept["package"], kept["version"], kept["door"], kept["not_offered"]) == ("theirs", "1.2", "module", 1)
     assert kept["diagnoses"] == [{"mutant": "m", "explained": ["bad"]}]
