@@ -81,7 +81,7 @@ def _card(data: Data, name: str) -> str:
         if name == summary.label(data)
         else f"<p>{escape(name)}</p>",
         f"<b>{counts['pass']} <small>of {summary.judged(data)} offered checks pass</small></b>",
-        f'<p class="{"good" if passed else "bad"}">{"Conforms in what it offers" if passed else "Does not conform"}</p>',
+        f'<p class="{"good" if passed else "bad"}">{summary.outcome(data)}</p>',
         f'<ul class="small">{problems}</ul>' if problems else "",
         f'<p class="small">{escape(", ".join(others))}</p>',
         *(f'<p class="small">{escape(line)}</p>' for line in (*summary.edition(data), summary.unchecked(data)) if line),

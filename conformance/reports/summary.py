@@ -187,6 +187,14 @@ def headline(data: Data) -> str:
     return f"failed: {'; '.join(problems(data))}"
 
 
+def outcome(data: Data) -> str:
+    """The verdict in a few words."""
+    if data["verdict"]["passed"]:
+        return "Conforms in what it offers"
+    extremes_alone = failures(data).extreme and not failures(data).ordinary and len(data["verdict"]["problems"]) == 1
+    return "Conforms with ordinary input only" if extremes_alone else "Does not conform"
+
+
 def problems(data: Data) -> list[str]:
     """What stands against the run, with the failures told apart: the verdict counts them all in its first problem."""
     found = failures(data)
