@@ -148,6 +148,15 @@ class Document(HTMLParser):
         self.text += data
 
 
+def test_the_verdict_in_words() -> None:
+    assert summary.outcome(make((PASS,))) == "Conforms in what it offers"
+    assert summary.outcome(make((PASS, FAIL))) == "Does not conform"
+    at_extremes = make((PASS, FAIL))
+    at_extremes["checks"][FAIL]["extreme"] = True
+    assert summary.outcome(at_extremes) == "Conforms with ordinary input only"
+    assert summary.outcome(make((PASS,), at_least=2)) == "Does not conform"
+
+
 def test_the_page(data: dict[str, Any]) -> None:
     document = Document(html.render([data]))
     assert "1 of 3 offered checks pass" in document.text
