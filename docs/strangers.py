@@ -84,7 +84,10 @@ def summary_table() -> str:
         counts = [len(result["checks"]), len(result["checks"]) - len(failed), extreme, *(kinds.count(kind) for kind in KINDS)]
         setting = f"{result['dtype']}, {result['edition']}"
         rows.append([f"[{package['title']}]({package['url']})", result["version"], result["date"], setting, *map(str, counts)])
-    return _table(["package", "version", "checked on", "precision, edition", "checks judged", "passed", "fail at extremes only", *KINDS.values()], rows)
+    return _table(
+        ["package", "version", "checked on", "precision, edition", "checks judged", "passed", "fail at extremes only", *KINDS.values()],
+        rows,
+    )
 
 
 def finding_sections() -> str:
