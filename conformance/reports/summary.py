@@ -131,7 +131,8 @@ def edition(data: Data) -> list[str]:
     """What the candidate was judged as and why, and which editions fit how well: sentences."""
     found = editions().get(data["edition"])
     title = f" ({found.title})" if found else ""
-    reason = {"given": "as asked", "claimed": "as it claims", "best fit": "which fits best"}[data["choice"]]
+    fits = "which fits as well as any" if data["fit"] and data["fit"]["alike"] else "which fits best"
+    reason = {"given": "as asked", "claimed": "as it claims", "best fit": fits}[data["choice"]]
     if data["choice"] == "given" and (claimed := data["implementation"]["edition"]) not in (None, data["edition"]):
         reason += f"; it claims {claimed}"
     lines = [f"Judged as the edition {data['edition']}{title}, {reason}."]
