@@ -4,12 +4,12 @@ import io
 import json
 import re
 from collections.abc import Mapping
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
 import pytest
+from html_document import Document
 from report_data import ABSENT, CHECKS, ERROR, FAIL, HOSTILE, PASS, adapter, make
 from rich.console import Console
 
@@ -122,30 +122,6 @@ def test_the_badge(data: dict[str, Any]) -> None:
     assert badge.outcome(make((ABSENT,))) == ("nothing offered", badge.GREY)
     assert badge.outcome(make((PASS,), at_least=2)) == ("failing", badge.RED)
     assert ElementTree.fromstring(badge.render(data)).get("aria-label") == "DreamerV3 conformance: 2 of 3 checks fail"
-
-
-class Document(HTMLParser):
-    """Elements and text of a page; fails where tags do not match."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.elements: list[tuple[str, dict[str, str | None]]] = []
-        self.text = ""
-        self._open: list[str] = []
-        self.feed(text)
-        self.close()
-        assert self._open == []
-
-    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
-        self.elements.append((tag, dict(attributes)))
-        if tag != "meta":
-            self._open.append(tag)
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self._open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        self.text += data
 
 
 def test_the_verdict_in_words() -> None:

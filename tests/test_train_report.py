@@ -5,12 +5,12 @@ import hashlib
 import json
 import math
 import re
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from html_document import Document
 from PIL import Image
 
 from train import checkpoint
@@ -23,7 +23,6 @@ from train.report.runs import Curve, RunLog, find_logdirs, group_runs, newest_pi
 from train.report.series import means, over_runs, over_values, stacked, thinned
 
 NOW = 2_000_000_000.0
-VOID = {"meta", "img", "br", "wbr"}
 NAN = float("nan")
 
 
@@ -43,36 +42,6 @@ def make_run(path: Path, lines: list[dict[str, Any]], **about: Any) -> Path:
 
 def page(*paths: Path) -> str:
     return render([read_run(path) for path in find_logdirs(paths)], NOW)
-
-
-class Document(HTMLParser):
-    """Elements and text of a page; fails where tags do not match."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.elements: list[tuple[str, dict[str, str | None]]] = []
-        self.text = ""
-        self._open: list[str] = []
-        self.feed(text)
-        self.close()
-        assert self._open == []
-
-    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
-        self.elements.append((tag, dict(attributes)))
-        if tag not in VOID:
-            self._open.append(tag)
-
-    def handle_startendtag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
-        self.elements.append((tag, dict(attributes)))
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self._open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        self.text += data
-
-    def count(self, tag: str) -> int:
-        return sum(name == tag for name, _ in self.elements)
 
 
 # Curves

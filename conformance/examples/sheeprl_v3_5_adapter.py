@@ -13,30 +13,17 @@ from importlib.metadata import version
 from types import SimpleNamespace as Namespace
 
 import torch
-from sheeprl.algos.dreamer_v3.loss import categorical_kl as their_kl
-from sheeprl.algos.dreamer_v3.utils import Moments
 from sheeprl.algos.dreamer_v3_5 import agent, dreamer_v3_5, loss
 from sheeprl.algos.dreamer_v3_5.optim import LaProp
 from sheeprl.utils.utils import symexp, symlog  # noqa: F401
+from sheeprl_adapter import categorical_kl, convert, percentile, return_scale, setup, update_return_range  # noqa: F401 - offered here, too
 from torch import nn
-from torch.distributions import Distribution
 
 __version__ = version("sheeprl")
-ALONE = Namespace(all_gather=lambda x: x)  # a Fabric of one process
-
-
-def setup(dtype):
-    Distribution.set_default_validate_args(False)  # as their command line does
-    torch.set_grad_enabled(False)
 
 
 def edition():
     return "official"
-
-
-def convert(array):
-    array = torch.as_tensor(array)
-    return array.float() if array.is_floating_point() else array
 
 
 # transforms and distributions
@@ -60,10 +47,6 @@ def symexp_twohot_mean(logits, bins):
 
 def unimix_log_probs(logits, unimix):
     return agent.RSSM(None, None, None, logits.shape[-1], unimix).uniform_mix(logits)[..., 0, :]
-
-
-def categorical_kl(log_probs_p, log_probs_q):
-    return their_kl(log_probs_p[..., None, :], log_probs_q[..., None, :])
 
 
 def bernoulli_loss(logit, target):
@@ -341,24 +324,6 @@ def cumulative_weights(continue_, discount):
     sizes = {"horizon": steps - 1, "discount": discount, "lmbda": 0.95}
     critic = lambda states: logits  # noqa: E731
     return dreamer_v3_5.imagine(model, lambda states: ([zero], None), critic, critic, zero, zero, **sizes)[-1][:-1].mT
-
-
-def percentile(values, q):
-    moments = Moments(decay=0.0, percentile_low=q / 100)
-    return moments(values, ALONE)[0]
-
-
-def update_return_range(low, high, returns, config):
-    moments = Moments(config.return_decay, 1.0, config.return_percentile_low / 100, config.return_percentile_high / 100)
-    moments.low, moments.high = torch.tensor(low), torch.tensor(high)
-    moments(returns, ALONE)
-    return moments.low, moments.high
-
-
-def return_scale(low, high, limit):
-    moments = Moments(decay=1.0, max_=1 / limit)
-    moments.low, moments.high = torch.tensor(low), torch.tensor(high)
-    return moments(torch.zeros(1), ALONE)[1]
 
 
 def behavior_losses(actor=None, imagined=None, actions=None, values=None, slow_values=None, returns=None, weight=None, scale=1.0, **given):
