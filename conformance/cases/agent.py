@@ -210,8 +210,8 @@ def compare_steps(run: Run, where: str, actual: Any, expected: Any, state: Any, 
 
 @check("AGT-29", "AGT-30", "BEH-21", "OPT-17", "OPT-21", "CON-22", uses=["train_step", "gradients"], level=3, dtypes=WHOLE)
 def train_step_matches(run: Run) -> None:
-    """Parameters, moments, slow critic, return range and latents after one step, with one kind of spaces and with all."""
-    for observation, action in (("vector", "discrete"), ("both", "mixed")):
+    """Parameters, moments, slow critic, return range and latents after one step, for every kind of task."""
+    for observation, action in COMBINATIONS:
         problem = problem_of(run, observation, action)
         gradients = run.call("gradients", *problem.loss_arguments)
         arguments = (problem.batch, problem.noise)
