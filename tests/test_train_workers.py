@@ -134,6 +134,13 @@ def test_too_many_failures_stop_the_run_with_the_workers_traceback(make: Make, p
     assert "train_fakes.py" in error.value.details
 
 
+def test_failures_are_told_in_the_order_of_the_environments(make: Make) -> None:
+    envs = make("Fragile", 2, True)
+    envs.reset([0, 1])
+    envs.step(trouble("error", 0, 2) + trouble("error", 1, 2) + np.float32([[0.2, 0], [0, 0]]))  # The first takes a second.
+    assert [failure.worker for failure in envs.take_failures()] == [0, 1]
+
+
 @pytest.mark.covers("LOOP-32")
 def test_failures_of_long_ago_are_forgotten(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(vector, "WINDOW", 10)

@@ -224,7 +224,10 @@ class FakeLearner:
 
 
 class Fragile(Counting):
-    """`Counting` whose second observation is random. An action whose second number is a key of TROUBLES gives that trouble instead."""
+    """`Counting` whose second observation is random.
+
+    What the first number of an action has above 5 is the seconds that it takes. If the second is a key of TROUBLES, it gives that trouble.
+    """
 
     TROUBLES: ClassVar[dict[float, str]] = {0.25: "error", 0.5: "garbage", 0.75: "timeout", 1.0: "crash"}
 
@@ -234,6 +237,7 @@ class Fragile(Counting):
         return observation, info
 
     def step(self, action: np.ndarray) -> Any:
+        time.sleep(max(0.0, float(action[0]) - 5.0))
         trouble = self.TROUBLES.get(float(action[1]))
         observation, reward, terminated, truncated, info = super().step(action)
         observation[1] = self.np_random.random()

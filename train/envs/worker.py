@@ -157,7 +157,7 @@ Worker = InProcess | OwnProcess
 
 
 def receive(workers: Mapping[int, Worker]) -> dict[int, Step | Failure]:
-    """The answers of these workers. They are waited for together, as long as the most patient of them allows."""
+    """The answers of these workers, in the order given. They are waited for together, as long as the most patient of them allows."""
     answers: dict[int, Step | Failure] = {}
     waiting: dict[connection.Connection, tuple[int, OwnProcess]] = {}
     for index, worker in workers.items():
@@ -171,7 +171,7 @@ def receive(workers: Mapping[int, Worker]) -> dict[int, Step | Failure]:
         for pipe in ready or list(waiting):
             index, late = waiting.pop(pipe)
             answers[index] = late.receive() if ready else late.expired()
-    return answers
+    return {index: answers[index] for index in workers}
 
 
 def _only(observation: Any) -> dict[str, np.ndarray]:
