@@ -2,6 +2,7 @@
 
 import json
 import os
+import pty
 import random
 import shutil
 import signal
@@ -110,6 +111,23 @@ def test_many_killed_runs_continue_bit_by_bit(backend: str, tmp_path: Path) -> N
             flush=True,
         )
     assert resumed > 50
+
+
+def test_a_closed_terminal_saves_and_leaves(tmp_path: Path) -> None:
+    """As when a connection is lost: the signal comes from the system, and nothing can be written to the terminal any more."""
+    call, log = command("torch", tmp_path / "run", "--checkpoint-every", "1e9"), tmp_path / "run" / "metrics.jsonl"
+    child, terminal = pty.fork()
+    if not child:
+        os.chdir(ROOT)
+        os.execv(call[0], call)
+    while not log.exists() or log.stat().st_size < 20_000:
+        assert os.read(terminal, 4096)
+    os.close(terminal)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 130
+    finish(call, tmp_path / "output.txt")
+    assert "continuing at step" in (tmp_path / "output.txt").read_text()
+    finish(command("torch", tmp_path / "whole", "--checkpoint-every", "1e9"), tmp_path / "whole.txt")
+    assert_same_run(tmp_path / "run", tmp_path / "whole")
 
 
 def test_a_signal_saves_and_leaves(tmp_path: Path) -> None:

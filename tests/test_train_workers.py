@@ -278,7 +278,7 @@ def test_workers_outlive_the_signals_that_are_for_the_trainer(make: Make) -> Non
     envs = make("Counting", 2, True)
     envs.reset([0, 1])
     for worker in worker_ids(envs):
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             os.kill(worker, number)
     assert envs.step(calm(2))["reward"].tolist() == [1, 1]
     assert envs.failures == 0

@@ -1,8 +1,9 @@
 """The loop of spec/12-training-loop.md: act, remember, learn."""
 
+import os
 import signal
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from types import FrameType
 from typing import Any
@@ -106,16 +107,23 @@ def learn(run: Run) -> None:
 
 @contextmanager
 def _interruptible(received: list[int]) -> Iterator[None]:
-    """The first Ctrl-C or termination signal is added to the list; the next one works as always."""
+    """The first Ctrl-C, termination signal or closed terminal is added to the list; the next one works as always.
+
+    Under `nohup` a closed terminal is ignored, as it wants.
+    """
     previous: dict[int, Any] = {}
+    terminals = [descriptor for descriptor in (0, 1, 2) if os.isatty(descriptor)]  # After the end they no longer say so.
 
     def receive(number: int, frame: FrameType | None) -> None:
         received.append(number)
         signal.signal(number, previous[number])
+        if number == signal.SIGHUP:
+            _silence(terminals)
 
     try:
-        for number in (int(signal.SIGINT), int(signal.SIGTERM)):
-            previous[number] = signal.signal(number, receive)
+        for number in (int(signal.SIGINT), int(signal.SIGTERM), int(signal.SIGHUP)):
+            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
+                previous[number] = signal.signal(number, receive)
     except ValueError:  # Not in the main thread: signals are somebody else's.
         previous.clear()
     try:
@@ -123,3 +131,11 @@ def _interruptible(received: list[int]) -> Iterator[None]:
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
+
+
+def _silence(terminals: Iterable[int]) -> None:
+    """What is still said goes nowhere: on a terminal that is closed, every write would be an error."""
+    nowhere = os.open(os.devnull, os.O_RDWR)
+    for descriptor in terminals:
+        os.dup2(nowhere, descriptor)
+    os.close(nowhere)

@@ -60,7 +60,7 @@ class Stream(gymnasium.Env[Observation, np.ndarray]):
         self.observation_space, self.action_space = array_spaces(spaces)
         self._nothing = {key: np.zeros(space.array_shape) for key, space in spaces.observations.items()}
         if os.getpid() != trainer:
-            for number in (signal.SIGINT, signal.SIGTERM):  # Sent to the whole group, they are for the trainer, which closes its workers.
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):  # Sent to the whole group, they are for the trainer, who closes.
                 signal.signal(number, signal.SIG_IGN)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
