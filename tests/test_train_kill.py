@@ -2,7 +2,6 @@
 
 import json
 import os
-import pty
 import random
 import shutil
 import signal
@@ -116,6 +115,8 @@ def test_many_killed_runs_continue_bit_by_bit(backend: str, tmp_path: Path) -> N
 def test_a_closed_terminal_saves_and_leaves(tmp_path: Path) -> None:
     """As when a connection is lost: the signal comes from the system, and nothing can be written to the terminal any more."""
     call, log = command("torch", tmp_path / "run", "--checkpoint-every", "1e9"), tmp_path / "run" / "metrics.jsonl"
+    import pty  # Not on Windows.
+
     try:
         child, terminal = pty.fork()
     except OSError as error:

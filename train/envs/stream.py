@@ -60,8 +60,8 @@ class Stream(gymnasium.Env[Observation, np.ndarray]):
         self.observation_space, self.action_space = array_spaces(spaces)
         self._nothing = {key: np.zeros(space.array_shape) for key, space in spaces.observations.items()}
         if os.getpid() != trainer:
-            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):  # Sent to the whole group, they are for the trainer, who closes.
-                signal.signal(number, signal.SIG_IGN)
+            for number in {signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)}:  # On Windows nothing hangs up.
+                signal.signal(number, signal.SIG_IGN)  # Sent to the whole group, they are for the trainer, which closes its workers.
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
         """`resume` as Gymnasium calls it. options: "episode" and "actions" of the history. Reward and flags are in the info."""
