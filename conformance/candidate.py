@@ -14,7 +14,7 @@ from conformance.adapter import COLUMNS, INTERFACE, OBJECTS, load_adapter
 from conformance.errors import UserError
 from conformance.foreign import ForeignAdapter, as_edition
 from conformance.process import ProcessAdapter
-from conformance.serve import convert_arrays, load_file, to_numpy
+from conformance.serve import convert_arrays, load_file, missing_field, to_numpy
 
 
 class ModuleAdapter(ForeignAdapter):
@@ -36,6 +36,10 @@ class ModuleAdapter(ForeignAdapter):
             result = function(*(convert_arrays(argument, convert) for argument in arguments))
         except SystemExit as error:  # not an Exception: it would end the kit, perhaps with exit code 0
             raise RuntimeError(f"{name} called sys.exit({error.code!r})") from error
+        except AttributeError as error:
+            if hint := missing_field(error):
+                error.add_note(hint)
+            raise
         try:
             return result if name in OBJECTS else to_numpy(result)
         except TypeError as error:

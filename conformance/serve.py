@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import base64
 import dataclasses
+import difflib
 import importlib.util
 import json
 import math
@@ -136,8 +137,18 @@ def answer(adapter: Any, request: Mapping[str, Any]) -> dict[str, Any]:
     except KeyError as error:  # a parameter is missing: its name says it
         kind, message = "KeyError", str(error.args[0] if error.args else error)
     except Exception as error:
-        kind, message = type(error).__name__, traceback.format_exc(limit=-4)
+        kind, message = type(error).__name__, traceback.format_exc(limit=-4) + missing_field(error)
     return {"id": request.get("id"), "error": {"kind": kind, "message": message}}
+
+
+def missing_field(error: Exception) -> str:
+    """Of an error because a configuration or spaces lack what was asked of them: the closest that they have. Of others nothing."""
+    given = getattr(error, "obj", None) if isinstance(error, AttributeError) else None
+    if not isinstance(given, SimpleNamespace) and (not dataclasses.is_dataclass(given) or isinstance(given, type)):
+        return ""
+    asked, fields = str(getattr(error, "name", "")), [name for name in dir(given) if not name.startswith("_")]
+    close = difflib.get_close_matches(asked, fields, n=3, cutoff=0.5)
+    return f"is {' or '.join(close)} meant instead of {asked}?" if close else f"there are: {', '.join(fields)}"
 
 
 def _result(adapter: Any, request: Mapping[str, Any]) -> Any:

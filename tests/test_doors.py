@@ -25,6 +25,7 @@ from conformance.errors import UserError
 from conformance.execute import Result, run_check, selected_checks
 from conformance.foreign import arranged
 from conformance.problems import small_config
+from conformance.reports import summary
 from conformance.serve import load_file, to_numpy
 from impl_torch import world_model
 from spec import Config
@@ -202,6 +203,24 @@ def test_setup_and_what_an_adapter_says_of_itself() -> None:
         "symlog_ is not a function of the interface; is symlog meant?",
     ]
     assert remarks(load_adapter("numpy")) == []
+
+
+def test_a_field_that_a_configuration_lacks_is_answered_with_those_that_are_near() -> None:
+    def kl_losses(posterior_logits: Any, prior_logits: Any, config: Any) -> Any:
+        return config.free_bits
+
+    result = run("world_model.kl_literals", module(kl_losses=kl_losses))
+    assert result.status == "error"
+    assert summary.cause(result.message).splitlines() == [
+        "AttributeError: 'Config' object has no attribute 'free_bits'",
+        "is free_nats meant instead of free_bits?",
+    ]
+    with pytest.raises(AttributeError) as error:
+        module(kl_losses=lambda posterior_logits, prior_logits, config: config.qqqq).kl_losses(0, 0, CONFIG)
+    assert error.value.__notes__[0].startswith("there are: actor_layers, ")
+    with pytest.raises(AttributeError) as error:
+        module(symlog=lambda x: x.qqqq).symlog(np.ones(2))
+    assert not hasattr(error.value, "__notes__")
 
 
 def test_an_edition_is_a_name() -> None:

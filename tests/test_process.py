@@ -321,6 +321,15 @@ def test_a_missing_parameter_is_named(tmp_path: Path) -> None:
     adapter.close()
 
 
+def test_a_field_that_a_configuration_lacks_is_answered_with_those_that_are_near(tmp_path: Path) -> None:
+    source = "def kl_losses(posterior_logits, prior_logits, config):\n    return config.free_bits"
+    (tmp_path / "mine.py").write_text(source, encoding="utf-8")
+    adapter = ProcessAdapter(shlex.join([sys.executable, "-m", "conformance.serve", str(tmp_path / "mine.py")]), "float64", 60.0)
+    with pytest.raises(CandidateError, match=r"(?s)AttributeError.*is free_nats meant instead of free_bits\?$"):
+        adapter.kl_losses(np.ones(2), np.ones(2), small_config("paper"))
+    adapter.close()
+
+
 def test_the_server_alone(server: ProcessAdapter) -> None:
     assert (server.name, server.version, server.edition()) == ("mine", "1.5", "paper")
     assert result_of(server).status == "pass"
