@@ -228,8 +228,8 @@ def fit(checks: Iterable[Check], adapter: object, dtype: str, seed: int = 0, exa
             known = _unknown(check, name, dtype, seed, examples)
             status = NOT_JUDGED if known else "error" if broken else ""
             status = status or judge(check, adapter, editions()[name], dtype, seed, examples, shrink=False, ordinary=True).status
-            statuses[check.name] = status
-            broken |= statuses[check.name] == "error"
+            statuses[check.name] = NOT_JUDGED if status == "not offered" else status
+            broken |= status == "error"
     return [Fit(name, statuses) for name, statuses in found.items()]
 
 

@@ -11,6 +11,8 @@ from conformance.strategies import ordinary_numbers
 from spec import editions
 
 FAILING = ("fail", "error")
+NOT_IMPLEMENTED = "not implemented: "
+"""How the message of a check begins that is not offered because the candidate raised a `NotImplementedError`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,6 +81,11 @@ def not_offered(check: Check, lacking: Iterable[str]) -> Result:
     return Result(check, "not offered", Worst(), 0, f"the adapter does not offer {', '.join(lacking)}")
 
 
+def not_implemented(check: Check, function: str, reason: str) -> Result:
+    """The candidate offers the function, and says that it lacks what this call asks for."""
+    return Result(check, "not offered", Worst(), 0, f"{NOT_IMPLEMENTED}{function}" + (f" ({reason})" if reason else ""))
+
+
 def run_check(check: Check, adapter: object, dtype: str, profile: str, seed: int = 0, examples: int = 25, shrink: bool = True) -> Result:
     """Runs one check; what the candidate raises becomes a result."""
     if lacking := missing(adapter, check):
@@ -95,6 +102,8 @@ def finish(check: Check, run: Run) -> Result:
         return Result(check, "fail", run.worst, run.compared, str(deviation), run.last_call)
     except CandidateLost as lost:
         return Result(check, "error", Worst(math.inf, math.inf, check.name), run.compared, str(lost), run.last_call)
+    except NotImplementedError as error:
+        return not_implemented(check, run.last_call.function if run.last_call else check.name, str(error))
     except (Exception, SystemExit):  # an object that the candidate made may call sys.exit
         return Result(check, "error", Worst(math.inf, math.inf, check.name), run.compared, traceback.format_exc(limit=-4), run.last_call)
     if not run.compared:

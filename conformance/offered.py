@@ -22,7 +22,7 @@ def unchecked(functions: Collection[str], results: Iterable[Result]) -> list[dic
     found = []
     for name in functions:
         using = [result for result in results if name in result.check.uses]
-        if using and all(result.status == "not offered" for result in using):
-            lacking = ([other for other in result.check.uses if other not in functions] for result in using)
+        lacking = [[other for other in result.check.uses if other not in functions] for result in using]
+        if lacking and all(lacking):
             found.append({"function": name, "needs": min(lacking, key=len)})
     return found

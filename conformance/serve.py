@@ -132,8 +132,8 @@ def answer(adapter: Any, request: Mapping[str, Any]) -> dict[str, Any]:
     """The reply to one request. Whatever the adapter raises becomes an error."""
     try:
         return {"id": request.get("id"), "result": _result(adapter, request)}
-    except ValueError as error:
-        kind, message = "ValueError", str(error)
+    except (ValueError, NotImplementedError) as error:
+        kind, message = "ValueError" if isinstance(error, ValueError) else "NotImplementedError", str(error)
     except KeyError as error:  # a parameter is missing: its name says it
         kind, message = "KeyError", str(error.args[0] if error.args else error)
     except Exception as error:

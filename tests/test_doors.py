@@ -28,6 +28,7 @@ from conformance.problems import small_config
 from conformance.reports import summary
 from conformance.serve import load_file, to_numpy
 from impl_torch import world_model
+from reference_numpy import networks
 from spec import Config
 
 TESTS = Path(__file__).resolve().parent
@@ -221,6 +222,34 @@ def test_a_field_that_a_configuration_lacks_is_answered_with_those_that_are_near
     with pytest.raises(AttributeError) as error:
         module(symlog=lambda x: x.qqqq).symlog(np.ones(2))
     assert not hasattr(error.value, "__notes__")
+
+
+class PoolsOnly(NumpyAdapter):
+    """The reference without strided convolutions."""
+
+    def encoder(self, params: Any, observation: Any, task: Any, config: Config) -> Any:
+        if task.images and config.cnn_sampling == "strided":
+            raise NotImplementedError("strided convolutions")
+        return networks.encoder(params, observation, task, config)
+
+
+def test_what_is_not_implemented_is_not_offered() -> None:
+    names = ("encoder_matches", "encoder_with_the_other_sampling_matches")
+    for profile, statuses in (("official", ["pass", "not offered"]), ("paper", ["not offered", "pass"])):
+        results = [run_check(CHECKS[f"networks.{name}"], PoolsOnly(), "float64", profile) for name in names]
+        assert [result.status for result in results] == statuses
+        assert [result.message for result in results if result.message] == ["not implemented: encoder (strided convolutions)"]
+    rest = [check for name, check in CHECKS.items() if name.startswith("networks.") and "encoder" in check.uses]
+    found = {check.name for check in rest if run_check(check, PoolsOnly(), "float64", "official").status == "not offered"}
+    assert found == {"networks.brightness_literals", "networks.encoder_with_the_other_sampling_matches"}
+
+
+def test_what_is_not_implemented_is_no_failure_of_a_drawn_case() -> None:
+    def symlog(x: Any) -> Any:
+        raise NotImplementedError
+
+    result = run("transforms.symlog_matches", module(symlog=symlog))
+    assert (result.status, result.message) == ("not offered", "not implemented: symlog")
 
 
 def test_an_edition_is_a_name() -> None:

@@ -330,6 +330,14 @@ def test_a_field_that_a_configuration_lacks_is_answered_with_those_that_are_near
     adapter.close()
 
 
+def test_what_is_not_implemented_is_not_offered(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text("def symlog(x):\n    raise NotImplementedError('negative numbers')", encoding="utf-8")
+    adapter = ProcessAdapter(shlex.join([sys.executable, "-m", "conformance.serve", str(tmp_path / "mine.py")]), "float64", 60.0)
+    result = run_check(CHECKS["transforms.symlog_matches"], adapter, "float64", "paper")
+    assert (result.status, result.message) == ("not offered", "not implemented: symlog (negative numbers)")
+    adapter.close()
+
+
 def test_the_server_alone(server: ProcessAdapter) -> None:
     assert (server.name, server.version, server.edition()) == ("mine", "1.5", "paper")
     assert result_of(server).status == "pass"

@@ -251,6 +251,16 @@ def test_offered_but_not_checked() -> None:
     assert line.replace("_", "\\_") in markdown.render(data)
 
 
+def test_what_is_not_implemented_is_told_once() -> None:
+    data = make()
+    for name in ("transforms.symlog_matches", "transforms.symexp_matches"):
+        data["checks"][name] = {**data["checks"][PASS], "status": "not offered", "message": "not implemented: symlog (negative numbers)"}
+    line = "Not implemented, as the candidate says: symlog (negative numbers)."
+    assert shown(data).count(line) == 1
+    assert line in Document(html.render([data])).text
+    assert line in markdown.render(data)
+
+
 def test_cells_say_what_was_not_offered(data: dict[str, Any]) -> None:
     page = html.render([data])
     assert '<td class="cell fail">1 fail, 1 not offered</td>' in page  # layers: RMSNorm raises, silu is absent

@@ -351,26 +351,35 @@ def pooling_matches(run: Run) -> None:
 
 
 @check("LAY-14", uses=["encoder", "decoder"], level=1)
-def image_stages_match(run: Run) -> None:
-    """Halving and doubling stages of both kinds, with and without a stage at full resolution, part by part."""
+def strided_image_stages_match(run: Run) -> None:
+    """Halving and doubling stages with strides, with and without a stage at full resolution, part by part."""
+    compare_image_stages(run, "strided")
+
+
+@check("LAY-14", uses=["encoder", "decoder"], level=1)
+def pooled_image_stages_match(run: Run) -> None:
+    """The same with pooling and upsampling."""
+    compare_image_stages(run, "pooled")
+
+
+def compare_image_stages(run: Run, sampling: str) -> None:
     task, rng = Spaces({"image": Image(8, 4, 2)}, {"action": Vector(1)}), run.rng()
-    for sampling in ("strided", "pooled"):
-        for outer in (False, True):
-            config = small_config(run.profile, run.dtype, cnn_sampling=sampling, cnn_outer=outer, cnn_multipliers=(1, 4), blocks=4)
-            params = {name: run.cast(value) for name, value in random_parameters(rng, config, task, run.dtype).items()}
-            image = rng.integers(0, 256, (2, 8, 4, 2)).astype(np.uint8)
-            x = image / 255 - 0.5
-            for index in range(2):
-                kernel, bias, scale = (params[f"encoder/image/conv{index}/{part}"] for part in ("kernel", "bias", "scale"))
-                halving = index == 1 or not outer
-                x = reference.convolution(x, kernel, bias, 2 if halving and sampling == "strided" else 1)
-                x = reference.max_pool(x) if halving and sampling == "pooled" else x
-                x = reference.silu(reference.rms_norm(x, scale, config.norm_epsilon))
-            tokens = run.call("encoder", params, {"image": image}, task, config)
-            run.compare(f"{sampling} encoder", tokens, x.reshape(2, -1), magnitude="tensor", factor=4)
-            feature = run.cast(rng.normal(size=(2, config.feature_size)))
-            expected = networks.decoder(params, feature, task, config)
-            run.compare(f"{sampling} decoder", run.call("decoder", params, feature, task, config), expected, magnitude="tensor", factor=4)
+    for outer in (False, True):
+        config = small_config(run.profile, run.dtype, cnn_sampling=sampling, cnn_outer=outer, cnn_multipliers=(1, 4), blocks=4)
+        params = {name: run.cast(value) for name, value in random_parameters(rng, config, task, run.dtype).items()}
+        image = rng.integers(0, 256, (2, 8, 4, 2)).astype(np.uint8)
+        x = image / 255 - 0.5
+        for index in range(2):
+            kernel, bias, scale = (params[f"encoder/image/conv{index}/{part}"] for part in ("kernel", "bias", "scale"))
+            halving = index == 1 or not outer
+            x = reference.convolution(x, kernel, bias, 2 if halving and sampling == "strided" else 1)
+            x = reference.max_pool(x) if halving and sampling == "pooled" else x
+            x = reference.silu(reference.rms_norm(x, scale, config.norm_epsilon))
+        tokens = run.call("encoder", params, {"image": image}, task, config)
+        run.compare("encoder", tokens, x.reshape(2, -1), magnitude="tensor", factor=4)
+        feature = run.cast(rng.normal(size=(2, config.feature_size)))
+        expected = networks.decoder(params, feature, task, config)
+        run.compare("decoder", run.call("decoder", params, feature, task, config), expected, magnitude="tensor", factor=4)
 
 
 @check("LAY-15", "CON-8", uses=[*SUMS, "rms_norm", "max_pool", "upsample", "dense", "mlp", "truncated_normal"], level=0)

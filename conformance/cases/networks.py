@@ -31,8 +31,17 @@ ROWS = 3
 LARGEST = 3.4028234663852886e38  # of float32; bfloat16 rounds it to infinity
 
 
-def config_of(run: Run, index: int = 0, **overrides: Any) -> Config:
-    return small_config(run.profile, run.dtype, **{"blocks": 2, **CONVOLUTIONS[index], **overrides})
+def config_of(run: Run, index: int | None = None, **overrides: Any) -> Config:
+    """A small configuration with the convolutions of that index; with None, of the kind that the profile has."""
+    plain = small_config(run.profile)
+    own = next(kind for kind in CONVOLUTIONS if (kind["cnn_sampling"], kind["cnn_outer"]) == (plain.cnn_sampling, plain.cnn_outer))
+    return small_config(run.profile, run.dtype, **{"blocks": 2, **(own if index is None else CONVOLUTIONS[index]), **overrides})
+
+
+def of_the_profile(run: Run, own: bool) -> list[int]:
+    """The indices of the convolutions that sample as the profile does, or else of the others."""
+    sampling = small_config(run.profile).cnn_sampling
+    return [index for index, kind in enumerate(CONVOLUTIONS) if (kind["cnn_sampling"] == sampling) == own]
 
 
 def params_of(run: Run, config: Config, task: Spaces = TASK, seed: int = 0) -> dict[str, np.ndarray]:
@@ -164,8 +173,18 @@ def brightness_is_scaled_in_float32(run: Run) -> None:
 
 @check("NET-3", *(f"NET-{n}" for n in range(6, 12)), "CON-6", uses=["encoder"], level=1)
 def encoder_matches(run: Run) -> None:
-    """Tokens of vectors and images together and of images alone, for both samplings, with an outer layer and without."""
-    for index in range(len(CONVOLUTIONS)):
+    """Tokens of vectors and images together and of images alone, sampled as in the profile, with an outer layer and without."""
+    compare_encoders(run, own=True)
+
+
+@check("NET-8", "NET-9", uses=["encoder"], level=1)
+def encoder_with_the_other_sampling_matches(run: Run) -> None:
+    """The same with the other choice of `cnn_sampling`."""
+    compare_encoders(run, own=False)
+
+
+def compare_encoders(run: Run, own: bool) -> None:
+    for index in of_the_profile(run, own):
         for task in (TASK, IMAGE_TASK):
             config = config_of(run, index)
             params, observations = params_of(run, config, task, index), observations_of(run.seed + index, task)
@@ -215,9 +234,19 @@ def stem_literals(run: Run) -> None:
 
 @check(*(f"NET-{n}" for n in range(13, 20)), "NET-1", uses=["decoder"], level=1)
 def decoder_matches(run: Run) -> None:
-    """Reconstructions of vectors and images together and of each alone, for both samplings, with an outer layer and without."""
-    for index in range(len(CONVOLUTIONS)):
-        for task in (TASK, IMAGE_TASK, VECTOR_TASK)[: 3 if index == 0 else 1]:
+    """Reconstructions of vectors and images together and of each alone, sampled as in the profile, with an outer layer and without."""
+    compare_decoders(run, own=True)
+
+
+@check("NET-17", "NET-18", uses=["decoder"], level=1)
+def decoder_with_the_other_sampling_matches(run: Run) -> None:
+    """Images with the other choice of `cnn_sampling`."""
+    compare_decoders(run, own=False)
+
+
+def compare_decoders(run: Run, own: bool) -> None:
+    for index in of_the_profile(run, own):
+        for task in (TASK, IMAGE_TASK, VECTOR_TASK) if own and index % 2 == 0 else (TASK,):
             config = config_of(run, index, decoder_layers=2 + index % 2)
             params, feature = params_of(run, config, task, index), features_of(run, config, ROWS, seed=index)
             expected = reference.decoder(params, feature, task, config)
@@ -339,7 +368,7 @@ def flat(result: Any, name: str = "") -> dict[str, np.ndarray]:
 @check("NET-12", uses=["encoder"], level=1)
 def sides_that_cannot_be_halved(run: Run) -> None:
     """A height or width that is no multiple of two to the number of halvings is refused before any network runs."""
-    for index in range(len(CONVOLUTIONS)):
+    for index in of_the_profile(run, own=True):
         for height, width in ((10, 12), (8, 6), (9, 8)):
             task = Spaces({"image": Image(height, width, 1), "position": Vector(2)}, ACTIONS)
             run.refuses("encoder", {}, observations_of(run.seed, task), task, config_of(run, index))

@@ -84,7 +84,7 @@ def _card(data: Data, name: str) -> str:
         f'<p class="{"good" if passed else "bad"}">{summary.outcome(data)}</p>',
         f'<ul class="small">{problems}</ul>' if problems else "",
         f'<p class="small">{escape(", ".join(others))}</p>',
-        *(f'<p class="small">{escape(line)}</p>' for line in (*summary.edition(data), summary.unchecked(data)) if line),
+        *(f'<p class="small">{escape(line)}</p>' for line in (*summary.edition(data), *summary.unchecked(data))),
         f'<p class="small muted">{escape(summary.settings(data))}; {escape(data["date"])}</p>',
         f'<p class="small muted">{escape(versions)}</p>',
     ]

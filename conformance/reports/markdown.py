@@ -12,7 +12,7 @@ def render(data: Data) -> str:
         f"# Conformance of {text(summary.label(data))}",
         f"**{text(summary.headline(data)).capitalize()}.**",
         f"{text(summary.settings(data))}, {text(data['date'])}. {text(summary.tally(data))}.",
-        text(" ".join([*summary.edition(data), summary.unchecked(data)])),
+        text(" ".join([*summary.edition(data), *summary.unchecked(data)])),
         _chapters(data),
         *_diagnoses(data),
         *_failures("Failures", summary.failures(data).ordinary),

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from importlib import resources
 from typing import Any
 
+from conformance.execute import NOT_IMPLEMENTED
 from spec import editions
 
 Data = Mapping[str, Any]
@@ -203,10 +204,13 @@ def problems(data: Data) -> list[str]:
     return [str(found), *rest[1:]] if found.ordinary or found.extreme else list(rest)
 
 
-def unchecked(data: Data) -> str:
-    """The functions that are offered and that no check could use: a line, or nothing."""
-    entries = [f"{entry['function']} (needs {', '.join(entry['needs'])})" for entry in data["unchecked"]]
-    return f"Offered but not checked: {', '.join(entries)}." if entries else ""
+def unchecked(data: Data) -> list[str]:
+    """Lines, if any: the functions that are offered and that no check could use, and what is said to be not implemented."""
+    lacking = [f"{entry['function']} (needs {', '.join(entry['needs'])})" for entry in data["unchecked"]]
+    messages = (check["message"] for check in data["checks"].values() if check["status"] == "not offered")
+    absent = dict.fromkeys(message.removeprefix(NOT_IMPLEMENTED).rstrip() for message in messages if message.startswith(NOT_IMPLEMENTED))
+    parts = {"Offered but not checked": lacking, "Not implemented, as the candidate says": absent}
+    return [f"{words}: {', '.join(entries)}." for words, entries in parts.items() if entries]
 
 
 def tally(data: Data) -> str:

@@ -21,9 +21,8 @@ def show(console: Console, data: Data) -> None:
     """Prints it. Control characters of an implementation's messages do nothing."""
     data = _printable(data)
     _chapters(console, data)
-    for line in (*summary.edition(data), summary.unchecked(data)):
-        if line:
-            _plain(console, line)
+    for line in (*summary.edition(data), *summary.unchecked(data)):
+        _plain(console, line)
     for diagnosis in data["diagnoses"]:
         _diagnosis(console, diagnosis)
     failures = summary.failures(data)
