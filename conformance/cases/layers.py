@@ -1,5 +1,6 @@
 """Checks of spec/03-layers.md."""
 
+from collections.abc import Iterable
 from typing import Any
 
 import hypothesis.strategies as st
@@ -351,20 +352,23 @@ def pooling_matches(run: Run) -> None:
 
 
 @check("LAY-14", uses=["encoder", "decoder"], level=1)
-def strided_image_stages_match(run: Run) -> None:
-    """Halving and doubling stages with strides, with and without a stage at full resolution, part by part."""
-    compare_image_stages(run, "strided")
+def image_stages_match(run: Run) -> None:
+    """Halving and doubling stages, and one at full resolution, part by part, of the kind that the profile has."""
+    plain = small_config(run.profile)
+    compare_image_stages(run, [(plain.cnn_sampling, plain.cnn_outer)])
 
 
 @check("LAY-14", uses=["encoder", "decoder"], level=1)
-def pooled_image_stages_match(run: Run) -> None:
-    """The same with pooling and upsampling."""
-    compare_image_stages(run, "pooled")
+def other_image_stages_match(run: Run) -> None:
+    """The same with the other choices of `cnn_sampling` and `cnn_outer`."""
+    plain = small_config(run.profile)
+    kinds = ((sampling, outer) for sampling in ("strided", "pooled") for outer in (False, True))
+    compare_image_stages(run, [kind for kind in kinds if kind != (plain.cnn_sampling, plain.cnn_outer)])
 
 
-def compare_image_stages(run: Run, sampling: str) -> None:
+def compare_image_stages(run: Run, kinds: Iterable[tuple[str, bool]]) -> None:
     task, rng = Spaces({"image": Image(8, 4, 2)}, {"action": Vector(1)}), run.rng()
-    for outer in (False, True):
+    for sampling, outer in kinds:
         config = small_config(run.profile, run.dtype, cnn_sampling=sampling, cnn_outer=outer, cnn_multipliers=(1, 4), blocks=4)
         params = {name: run.cast(value) for name, value in random_parameters(rng, config, task, run.dtype).items()}
         image = rng.integers(0, 256, (2, 8, 4, 2)).astype(np.uint8)
@@ -376,10 +380,10 @@ def compare_image_stages(run: Run, sampling: str) -> None:
             x = reference.max_pool(x) if halving and sampling == "pooled" else x
             x = reference.silu(reference.rms_norm(x, scale, config.norm_epsilon))
         tokens = run.call("encoder", params, {"image": image}, task, config)
-        run.compare("encoder", tokens, x.reshape(2, -1), magnitude="tensor", factor=4)
+        run.compare(f"{sampling} encoder", tokens, x.reshape(2, -1), magnitude="tensor", factor=4)
         feature = run.cast(rng.normal(size=(2, config.feature_size)))
         expected = networks.decoder(params, feature, task, config)
-        run.compare("decoder", run.call("decoder", params, feature, task, config), expected, magnitude="tensor", factor=4)
+        run.compare(f"{sampling} decoder", run.call("decoder", params, feature, task, config), expected, magnitude="tensor", factor=4)
 
 
 @check("LAY-15", "CON-8", uses=[*SUMS, "rms_norm", "max_pool", "upsample", "dense", "mlp", "truncated_normal"], level=0)

@@ -33,15 +33,19 @@ LARGEST = 3.4028234663852886e38  # of float32; bfloat16 rounds it to infinity
 
 def config_of(run: Run, index: int | None = None, **overrides: Any) -> Config:
     """A small configuration with the convolutions of that index; with None, of the kind that the profile has."""
+    index = own_convolutions(run)[0] if index is None else index
+    return small_config(run.profile, run.dtype, **{"blocks": 2, **CONVOLUTIONS[index], **overrides})
+
+
+def own_convolutions(run: Run) -> list[int]:
+    """Which of CONVOLUTIONS is of the kind that the profile has. Code that has no other can be checked with it."""
     plain = small_config(run.profile)
-    own = next(kind for kind in CONVOLUTIONS if (kind["cnn_sampling"], kind["cnn_outer"]) == (plain.cnn_sampling, plain.cnn_outer))
-    return small_config(run.profile, run.dtype, **{"blocks": 2, **(own if index is None else CONVOLUTIONS[index]), **overrides})
+    kinds = [(kind["cnn_sampling"], kind["cnn_outer"]) for kind in CONVOLUTIONS]
+    return [kinds.index((plain.cnn_sampling, plain.cnn_outer))]
 
 
-def of_the_profile(run: Run, own: bool) -> list[int]:
-    """The indices of the convolutions that sample as the profile does, or else of the others."""
-    sampling = small_config(run.profile).cnn_sampling
-    return [index for index, kind in enumerate(CONVOLUTIONS) if (kind["cnn_sampling"] == sampling) == own]
+def other_convolutions(run: Run) -> list[int]:
+    return [index for index in range(len(CONVOLUTIONS)) if index not in own_convolutions(run)]
 
 
 def params_of(run: Run, config: Config, task: Spaces = TASK, seed: int = 0) -> dict[str, np.ndarray]:
@@ -173,18 +177,18 @@ def brightness_is_scaled_in_float32(run: Run) -> None:
 
 @check("NET-3", *(f"NET-{n}" for n in range(6, 12)), "CON-6", uses=["encoder"], level=1)
 def encoder_matches(run: Run) -> None:
-    """Tokens of vectors and images together and of images alone, sampled as in the profile, with an outer layer and without."""
-    compare_encoders(run, own=True)
+    """Tokens of vectors and images together and of images alone, with the kind of convolutions that the profile has."""
+    compare_encoders(run, own_convolutions(run))
 
 
 @check("NET-8", "NET-9", uses=["encoder"], level=1)
-def encoder_with_the_other_sampling_matches(run: Run) -> None:
-    """The same with the other choice of `cnn_sampling`."""
-    compare_encoders(run, own=False)
+def encoder_with_other_convolutions_matches(run: Run) -> None:
+    """The same with the other choices of `cnn_sampling` and `cnn_outer`."""
+    compare_encoders(run, other_convolutions(run))
 
 
-def compare_encoders(run: Run, own: bool) -> None:
-    for index in of_the_profile(run, own):
+def compare_encoders(run: Run, kinds: list[int]) -> None:
+    for index in kinds:
         for task in (TASK, IMAGE_TASK):
             config = config_of(run, index)
             params, observations = params_of(run, config, task, index), observations_of(run.seed + index, task)
@@ -234,19 +238,19 @@ def stem_literals(run: Run) -> None:
 
 @check(*(f"NET-{n}" for n in range(13, 20)), "NET-1", uses=["decoder"], level=1)
 def decoder_matches(run: Run) -> None:
-    """Reconstructions of vectors and images together and of each alone, sampled as in the profile, with an outer layer and without."""
-    compare_decoders(run, own=True)
+    """Reconstructions of vectors and images together and of each alone, with the kind of convolutions that the profile has."""
+    compare_decoders(run, own_convolutions(run), (TASK, IMAGE_TASK, VECTOR_TASK))
 
 
 @check("NET-17", "NET-18", uses=["decoder"], level=1)
-def decoder_with_the_other_sampling_matches(run: Run) -> None:
-    """Images with the other choice of `cnn_sampling`."""
-    compare_decoders(run, own=False)
+def decoder_with_other_convolutions_matches(run: Run) -> None:
+    """Vectors and images together with the other choices of `cnn_sampling` and `cnn_outer`."""
+    compare_decoders(run, other_convolutions(run), (TASK,))
 
 
-def compare_decoders(run: Run, own: bool) -> None:
-    for index in of_the_profile(run, own):
-        for task in (TASK, IMAGE_TASK, VECTOR_TASK) if own and index % 2 == 0 else (TASK,):
+def compare_decoders(run: Run, kinds: list[int], tasks: tuple[Spaces, ...]) -> None:
+    for index in kinds:
+        for task in tasks:
             config = config_of(run, index, decoder_layers=2 + index % 2)
             params, feature = params_of(run, config, task, index), features_of(run, config, ROWS, seed=index)
             expected = reference.decoder(params, feature, task, config)
@@ -368,10 +372,9 @@ def flat(result: Any, name: str = "") -> dict[str, np.ndarray]:
 @check("NET-12", uses=["encoder"], level=1)
 def sides_that_cannot_be_halved(run: Run) -> None:
     """A height or width that is no multiple of two to the number of halvings is refused before any network runs."""
-    for index in of_the_profile(run, own=True):
-        for height, width in ((10, 12), (8, 6), (9, 8)):
-            task = Spaces({"image": Image(height, width, 1), "position": Vector(2)}, ACTIONS)
-            run.refuses("encoder", {}, observations_of(run.seed, task), task, config_of(run, index))
+    for height, width in ((10, 12), (8, 6), (9, 8)):
+        task = Spaces({"image": Image(height, width, 1), "position": Vector(2)}, ACTIONS)
+        run.refuses("encoder", {}, observations_of(run.seed, task), task, config_of(run))
 
 
 @check("NET-2", "NET-6", "NET-27", "CON-6", "CON-8", uses=["encoder"], level=1)

@@ -5,8 +5,8 @@ calling that function with stand-ins for the networks, one element at a time: `w
 weights, and `actor_critic_loss` for the losses of actor and critic. Their policies have either real or discrete actions; where an agent
 has both, each action key gets a policy of its own here, and log-probabilities and entropies are added up as theirs are.
 
-Not offered: samples from given noise, since they draw with the generator of PyTorch; encoder and decoder, whose checks also ask for strided
-convolutions; whole training steps, which take a configuration of Hydra and a Fabric.
+Layers, encoder and decoder stand in `sheeprl_v3_5_networks`. Not offered: samples from given noise, since they draw with the generator of
+PyTorch; whole training steps, which take a configuration of Hydra and a Fabric.
 """
 
 from importlib.metadata import version
@@ -17,6 +17,19 @@ from sheeprl.algos.dreamer_v3_5 import agent, dreamer_v3_5, loss
 from sheeprl.algos.dreamer_v3_5.optim import LaProp
 from sheeprl.utils.utils import symexp, symlog  # noqa: F401
 from sheeprl_adapter import categorical_kl, convert, percentile, return_scale, setup, update_return_range  # noqa: F401 - offered here, too
+from sheeprl_v3_5_networks import (  # noqa: F401 - some are offered here, too
+    block_linear,
+    decoder,
+    dense_of,
+    encoder,
+    fill,
+    linear,
+    max_pool,
+    mlp_of,
+    out_of,
+    rms_norm,
+    upsample,
+)
 from torch import nn
 
 __version__ = version("sheeprl")
@@ -72,55 +85,6 @@ def draw_categorical(logits, unimix, seed, n):
     torch.manual_seed(seed)
     rssm = agent.RSSM(None, None, None, logits.shape[-1], unimix)
     return rssm.sample(rssm.uniform_mix(logits.flatten(-2).expand(n, -1))).unflatten(-1, logits.shape)
-
-
-# layers
-
-
-def fill(module, tensors):
-    """The module with these tensors as its parameters, in their order."""
-    for parameter, tensor in zip(module.parameters(), tensors, strict=True):
-        assert parameter.shape == tensor.shape, (parameter.shape, tensor.shape)
-        parameter.copy_(tensor)
-    return module
-
-
-def dense_of(params, *names):
-    return [x for name in names for x in (params[f"{name}/kernel"].mT, params[f"{name}/bias"], params[f"{name}/scale"])]
-
-
-def mlp_of(params, name, layers):
-    return dense_of(params, *(f"{name}/hidden{i}" for i in range(layers)))
-
-
-def out_of(params, name):
-    return [params[f"{name}/kernel"].mT, params[f"{name}/bias"]]
-
-
-def linear(x, kernel, bias):
-    return fill(agent.Linear(*kernel.shape), (kernel.mT, bias))(x)
-
-
-def block_linear(x, kernel, bias):
-    blocks, inputs, outputs = kernel.shape
-    return fill(agent.BlockLinear(blocks * inputs, blocks * outputs, blocks), (kernel, bias))(x)
-
-
-def rms_norm(x, scale, epsilon):
-    return fill(agent.RMSNorm(len(scale), epsilon), [scale])(x)
-
-
-def max_pool(x):
-    return of_images(agent.MaxPool(), x)
-
-
-def upsample(x):
-    return of_images(agent.Upsample(), x)
-
-
-def of_images(module, x):
-    y = module(x.reshape(-1, *x.shape[-3:]).permute(0, 3, 1, 2)).permute(0, 2, 3, 1)
-    return y.reshape(*x.shape[:-3], *y.shape[1:])
 
 
 # rssm
