@@ -102,6 +102,8 @@ def encoder(params, observation, spaces, config):
 def vector_input(x, space):
     if not hasattr(space, "classes"):
         return symlog(x)
+    if x.is_floating_point():
+        raise ValueError("discrete observations are whole numbers")
     hots = (torch.nn.functional.one_hot(entry.long(), count) for entry, count in zip(x.unbind(-1), space.classes, strict=True))
     return torch.cat([hot.float() for hot in hots], -1)
 
