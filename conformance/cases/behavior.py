@@ -1,6 +1,7 @@
 """Checks of spec/08-behavior.md."""
 
 import math
+from collections.abc import Iterator
 from typing import Any
 
 import hypothesis.strategies as st
@@ -175,33 +176,51 @@ def value_logits(run: Run, seed: int, shape: tuple[int, int], bins: int, slow: b
     return run.cast(logits)
 
 
-@check("BEH-12", "BEH-14", uses=["critic_loss", "replay_critic_loss"], level=0)
+@check("BEH-12", uses=["critic_loss"], level=0)
 def critic_loss_literals(run: Run) -> None:
     """Equal logits cost 2 ln 255 whatever the targets; the slow critic is a target as the two-hot of its mean, not as a distribution."""
     config = config_of(run, bins=255, slow_critic_scale=1.0)
-    shape = (1, 3)
-    equal, returns, weight = np.zeros((*shape, 255)), np.array([[0.0, -50, 1e12]]), np.array([[1.0, 0.5, 0]])
+    equal, returns, weight = np.zeros((1, 3, 255)), np.array([[0.0, -50, 1e12]]), np.array([[1.0, 0.5, 0]])
     run.expect("critic_loss", (equal, equal, returns, weight, config), 11.082527 * weight, bound=LITERAL["float32"])
-    halves = np.full((*shape, 255), -1e4)
-    halves[..., 127] = halves[..., 129] = 0
-    # -ln softmax is c at the bin 127, c - 8 at 128 and c - 16 at 129; return 0 lies on 127, the mean 0.185103 between 128 and 129.
-    logits = equal.copy()
-    logits[..., 128], logits[..., 129] = 8, 16
-    c = math.log(253 + math.exp(8) + math.exp(16))
-    towards_slow = 0.927147 * (c - 8) + 0.072853 * (c - 16)
-    for slow_scale in (1.0, 0.25, 0.0):
-        config = config_of(run, bins=255, slow_critic_scale=slow_scale, critic_scale=5.0, replay_critic_scale=7.0)
-        loss = c + slow_scale * towards_slow
-        arguments = (logits, run.cast(halves), np.zeros(shape))
+    for arguments, loss, config in losses_towards_the_mean(run):
         run.expect("critic_loss", (*arguments, weight, config), loss * weight, bound=LITERAL["float32"])
-        is_last = np.array([[False, True, False]])
+
+
+@check("BEH-12", "BEH-14", uses=["replay_critic_loss"], level=0)
+def replay_critic_loss_literals(run: Run) -> None:
+    """The same, where the last step of an episode costs nothing."""
+    is_last = np.array([[False, True, False]])
+    for arguments, loss, config in losses_towards_the_mean(run):
         run.expect("replay_critic_loss", (*arguments, is_last, config), loss * (1 - is_last), bound=LITERAL["float32"])
 
 
-@check("BEH-12", "BEH-14", "BEH-17", "BEH-22", uses=["critic_loss", "replay_critic_loss"], level=0)
-def critic_losses_match(run: Run) -> None:
-    """Every entry on its own, over the bins of the configuration, for returns of any size and flags of any type."""
+def losses_towards_the_mean(run: Run) -> Iterator[tuple[tuple[np.ndarray, ...], float, Config]]:
+    """Logits, slow logits and returns [1, 3], and the loss of each entry, for several shares of the slow critic."""
+    slow = np.full((1, 3, 255), -1e4)
+    slow[..., 127] = slow[..., 129] = 0
+    # -ln softmax is c at the bin 127, c - 8 at 128 and c - 16 at 129; return 0 lies on 127, the mean 0.185103 between 128 and 129.
+    logits = np.zeros((1, 3, 255))
+    logits[..., 128], logits[..., 129] = 8, 16
+    c = math.log(253 + math.exp(8) + math.exp(16))
+    towards_slow = 0.927147 * (c - 8) + 0.072853 * (c - 16)
+    for share in (1.0, 0.25, 0.0):
+        config = config_of(run, bins=255, slow_critic_scale=share, critic_scale=5.0, replay_critic_scale=7.0)
+        yield (logits, run.cast(slow), np.zeros((1, 3))), c + share * towards_slow, config
 
+
+@check("BEH-12", "BEH-17", "BEH-22", uses=["critic_loss"], level=0)
+def critic_loss_matches(run: Run) -> None:
+    """Every entry on its own, over the bins of the configuration, for returns of any size."""
+    compare_critic_losses(run, "critic_loss")
+
+
+@check("BEH-12", "BEH-14", "BEH-17", "BEH-22", uses=["replay_critic_loss"], level=0)
+def replay_critic_loss_matches(run: Run) -> None:
+    """The same, for flags of any type."""
+    compare_critic_losses(run, "replay_critic_loss")
+
+
+def compare_critic_losses(run: Run, function: str) -> None:
     @run.for_all(
         seed=seeds(), bins=st.sampled_from([31, 255]), slow_scale=st.sampled_from([0.5, 1.0]), flags=st.sampled_from([bool, float])
     )
@@ -213,10 +232,9 @@ def critic_losses_match(run: Run) -> None:
         weight = run.cast(rng.random((4, 3)))
         is_last: np.ndarray = (rng.random((4, 3)) < 0.4).astype(flags)
         size = (bins + 64) * (2 + np.ptp(logits, -1)) * (2 + np.ptp(slow, -1))
-        arguments = (logits, slow, returns, weight, config)
-        run.expect("critic_loss", arguments, reference.critic_loss(*arguments), magnitude=size * weight, bound=run.u)
-        arguments = (logits, slow, returns, is_last, config)
-        run.expect("replay_critic_loss", arguments, reference.replay_critic_loss(*arguments), magnitude=size, bound=run.u)
+        entries, magnitude = (weight, size * weight) if function == "critic_loss" else (is_last, size)
+        arguments = (logits, slow, returns, entries, config)
+        run.expect(function, arguments, getattr(reference, function)(*arguments), magnitude=magnitude, bound=run.u)
 
 
 @check("BEH-16", "BEH-17", uses=["losses"], level=2, dtypes=WHOLE)
