@@ -15,7 +15,8 @@ Uncomment what your implementation offers and call your own code in it. Everythi
 time second; give back arrays of any library. `docs/adapters.md` of dreamer-spec explains the rest. Good first functions: lambda_return,
 kl_losses, symexp_twohot_loss and core, where most mistakes are.
 
-Numbers that come as arguments, and those of `config`, vary from call to call: hand them on, as a number written into the code fails.
+Numbers that come as arguments, and those of `config`, vary from call to call: hand them on, as a number written into the code fails. Where
+`config` makes a choice that your code does not have, raise NotImplementedError("which one").
 
 In the shapes: B sequences of T steps, N starts of H imagined steps, D memory units, S latents of C classes, A numbers of a flat action.
 `params` is a dict from canonical names (`rssm/gru/kernel`) to arrays: your function brings them into its own layers first.
