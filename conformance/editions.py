@@ -26,6 +26,7 @@ from spec import Edition, editions
 NOT_JUDGED = "not in edition"
 REACH_EXAMPLES = 5  # cases that show which functions a check reaches
 FIT_EXAMPLES = 5
+AGAIN = 4  # times as many cases show that a failure is with extreme input only: few would by chance be gentle
 GRADIENTS = {"gradients", "gradients_given", "loss_derivatives"}
 PREFERRED = ("paper", "2024-12", "2024-04", "2023")
 """The order of editions that fit equally well."""
@@ -87,7 +88,7 @@ def judge_twice(check: Check, adapter: object, edition: Edition, dtype: str, see
     result = judge(check, adapter, edition, dtype, seed, examples)
     if result.status not in FAILING:
         return result
-    again = judge(check, adapter, edition, dtype, seed, examples, shrink=False, ordinary=True)
+    again = judge(check, adapter, edition, dtype, seed, AGAIN * examples, shrink=False, ordinary=True)
     return dataclasses.replace(result, extreme=again.status == "pass")
 
 

@@ -15,7 +15,7 @@ from spec import editions
 SERVE = Path(__file__).resolve().parent.parent / "conformance" / "serve.py"
 EXAMPLES = SERVE.parent / "examples"
 MODULES = {"di_engine": "ding", "rllib": "ray", "sheeprl_v3_5": "sheeprl"}  # the others are called as their packages
-FEW = 10
+FEW, MANY = 10, 250  # cases of a property
 SLOW = {"equinox", "haiku"}  # JAX compiles each layer of each shape
 BESIDE_US = [
     pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name, result in strangers().items() if result["door"] == "module"
@@ -51,7 +51,8 @@ def failing_checks(adapter: object, result: dict[str, Any], names: set[str], exa
 
 @pytest.mark.parametrize("name", BESIDE_US)
 def test_the_kit_finds_what_is_recorded(name: str) -> None:
-    """What fails in a few cases has failed in the many of the record; what has failed there and not here fails with as many."""
+    """What fails in a few cases has failed in the many of the record; what has failed there and not here fails in very many: which
+    cases are drawn depends on the code, and some deviations are rare."""
     version, result = recorded_version(name), strangers()[name]
     recorded = set(failing(result))
     with candidate(str(EXAMPLES / f"{name}_adapter.py"), None, result["dtype"], None, 60) as adapter:
@@ -60,7 +61,7 @@ def test_the_kit_finds_what_is_recorded(name: str) -> None:
         assert offered == set(result["checks"])
         found = failing_checks(adapter, result, offered, FEW)
         assert found <= recorded
-        assert failing_checks(adapter, result, recorded - found, result["examples"]) == recorded - found
+        assert failing_checks(adapter, result, recorded - found, MANY) == recorded - found
 
 
 @pytest.mark.slow
