@@ -248,6 +248,14 @@ def test_a_candidate_that_raises_is_asked_once() -> None:
     assert len(asked) == 1
 
 
+def test_what_is_not_implemented_speaks_neither_for_nor_against_an_edition() -> None:
+    def twohot(x: np.ndarray, bins: np.ndarray) -> np.ndarray:
+        raise NotImplementedError("soft targets")
+
+    fits = fit([CHECKS["transforms.twohot_literals"]], types.SimpleNamespace(twohot=twohot), "float64")
+    assert [dict(one.statuses) for one in fits] == [{"transforms.twohot_literals": NOT_JUDGED}] * 4
+
+
 # --- The command -------------------------------------------------------------------------------------------------------------------------
 
 FIRST = """
