@@ -112,24 +112,27 @@ def test_many_killed_runs_continue_bit_by_bit(backend: str, tmp_path: Path) -> N
     assert resumed > 50
 
 
+HANG_UP = """
+import os, pty, signal, sys
+log, size, *call = sys.argv[1:]
+child, terminal = pty.fork()
+if not child:
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # Under nohup it would be ignored.
+    os.execv(call[0], call)
+while not os.path.exists(log) or os.stat(log).st_size < int(size):
+    os.read(terminal, 4096)
+os.close(terminal)
+sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+"""
+
+
 def test_a_closed_terminal_saves_and_leaves(tmp_path: Path) -> None:
     """As when a connection is lost: the signal comes from the system, and nothing can be written to the terminal any more."""
-    call, log = command("torch", tmp_path / "run", "--checkpoint-every", "1e9"), tmp_path / "run" / "metrics.jsonl"
-    import pty  # Not on Windows.
-
-    try:
-        child, terminal = pty.fork()
-    except OSError as error:
-        pytest.skip(f"no pseudo-terminal: {error}")
-    if not child:
-        os.chdir(ROOT)
-        os.execv(call[0], call)
-    while not log.exists() or log.stat().st_size < 20_000:
-        assert os.read(terminal, 4096)
-    os.close(terminal)
-    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 130
-    finish(call, tmp_path / "output.txt")
-    assert "continuing at step" in (tmp_path / "output.txt").read_text()
+    call, output = command("torch", tmp_path / "run", "--checkpoint-every", "1e9"), tmp_path / "output.txt"
+    log = tmp_path / "run" / "metrics.jsonl"
+    assert start([sys.executable, "-c", HANG_UP, str(log), "20000", *call], output).wait() == 130, output.read_text()
+    finish(call, output)
+    assert "continuing at step" in output.read_text()
     finish(command("torch", tmp_path / "whole", "--checkpoint-every", "1e9"), tmp_path / "whole.txt")
     assert_same_run(tmp_path / "run", tmp_path / "whole")
 
