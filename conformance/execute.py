@@ -102,9 +102,9 @@ def finish(check: Check, run: Run) -> Result:
         return Result(check, "fail", run.worst, run.compared, str(deviation), run.last_call)
     except CandidateLost as lost:
         return Result(check, "error", Worst(math.inf, math.inf, check.name), run.compared, str(lost), run.last_call)
-    except NotImplementedError as error:
-        return not_implemented(check, run.last_call.function if run.last_call else check.name, str(error))
-    except (Exception, SystemExit):  # an object that the candidate made may call sys.exit
+    except (Exception, SystemExit) as error:  # an object that the candidate made may call sys.exit
+        if isinstance(error, NotImplementedError) and getattr(run.adapter, "refuses_anyhow", False):  # not of our own columns
+            return not_implemented(check, run.last_call.function if run.last_call else check.name, str(error))
         return Result(check, "error", Worst(math.inf, math.inf, check.name), run.compared, traceback.format_exc(limit=-4), run.last_call)
     if not run.compared:
         return Result(check, "error", run.worst, 0, "the check compared nothing")

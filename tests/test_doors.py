@@ -225,7 +225,9 @@ def test_a_field_that_a_configuration_lacks_is_answered_with_those_that_are_near
 
 
 class PoolsOnly(NumpyAdapter):
-    """The reference without strided convolutions."""
+    """The reference without strided convolutions, as somebody else's program."""
+
+    refuses_anyhow = True
 
     def encoder(self, params: Any, observation: Any, task: Any, config: Config) -> Any:
         if task.images and config.cnn_sampling == "strided":
@@ -242,6 +244,11 @@ def test_what_is_not_implemented_is_not_offered() -> None:
     rest = [check for name, check in CHECKS.items() if name.startswith("networks.") and "encoder" in check.uses]
     found = {check.name for check in rest if run_check(check, PoolsOnly(), "float64", "official").status == "not offered"}
     assert found == {"networks.brightness_literals", "networks.encoder_with_other_convolutions_matches"}
+
+
+def test_our_own_columns_have_no_such_excuse(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(PoolsOnly, "refuses_anyhow", False)
+    assert run("networks.encoder_matches", PoolsOnly()).status == "error"
 
 
 def test_what_is_not_implemented_is_no_failure_of_a_drawn_case() -> None:

@@ -252,7 +252,7 @@ def test_what_is_not_implemented_speaks_neither_for_nor_against_an_edition() -> 
     def twohot(x: np.ndarray, bins: np.ndarray) -> np.ndarray:
         raise NotImplementedError("soft targets")
 
-    fits = fit([CHECKS["transforms.twohot_literals"]], types.SimpleNamespace(twohot=twohot), "float64")
+    fits = fit([CHECKS["transforms.twohot_literals"]], types.SimpleNamespace(twohot=twohot, refuses_anyhow=True), "float64")
     assert [dict(one.statuses) for one in fits] == [{"transforms.twohot_literals": NOT_JUDGED}] * 4
 
 

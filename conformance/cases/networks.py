@@ -372,9 +372,10 @@ def flat(result: Any, name: str = "") -> dict[str, np.ndarray]:
 @check("NET-12", uses=["encoder"], level=1)
 def sides_that_cannot_be_halved(run: Run) -> None:
     """A height or width that is no multiple of two to the number of halvings is refused before any network runs."""
-    for height, width in ((10, 12), (8, 6), (9, 8)):
-        task = Spaces({"image": Image(height, width, 1), "position": Vector(2)}, ACTIONS)
-        run.refuses("encoder", {}, observations_of(run.seed, task), task, config_of(run))
+    for index in range(len(CONVOLUTIONS)):
+        for height, width in ((10, 12), (8, 6), (9, 8)):
+            task = Spaces({"image": Image(height, width, 1), "position": Vector(2)}, ACTIONS)
+            run.refuses("encoder", {}, observations_of(run.seed, task), task, config_of(run, index))
 
 
 @check("NET-2", "NET-6", "NET-27", "CON-6", "CON-8", uses=["encoder"], level=1)
