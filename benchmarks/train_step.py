@@ -20,6 +20,7 @@ from benchmarks.machine import command, matrix_rate
 from spec import Config, Image, Spaces, Vector, load_config
 from train.backend import learner_class
 from train.machine import describe
+from train.threads import choose, spin_briefly
 
 OBSERVATIONS = {"vector": {"vector": Vector(24)}, "image": {"image": Image(64, 64, 3)}}
 
@@ -41,13 +42,23 @@ def random_batch(rng: np.random.Generator, config: Config, spaces: Spaces) -> di
 
 
 def measure(
-    backend: str, size: str, observation: str, profile: str, dtype: str, device: str | None, steps: int, **overrides: Any
+    backend: str,
+    size: str,
+    observation: str,
+    profile: str,
+    dtype: str,
+    device: str | None,
+    steps: int,
+    threads: int | None = None,
+    **overrides: Any,
 ) -> dict[str, Any]:
     """One case in this process: seconds from start to the end of the first step, median seconds of the others, peak memory."""
     start = time.perf_counter()
     config = load_config(profile, size, compute_dtype=dtype, **overrides)
     spaces = Spaces(OBSERVATIONS[observation], {"action": Vector(6)})
-    learner = learner_class(backend)(spaces, config, seed=0, device=device)
+    spin_briefly()
+    threads = choose(backend, config, spaces, threads)
+    learner = learner_class(backend)(spaces, config, seed=0, device=device, threads=threads)
     batch = random_batch(np.random.default_rng(0), config, spaces)
     finish(learner.train_step(batch, 0))
     first = time.perf_counter() - start
@@ -63,6 +74,7 @@ def measure(
         "profile": profile,
         "dtype": dtype,
         "device": learner.device,
+        "threads": threads,
         "batch": [config.batch_size, config.batch_length],
         "first_step_s": round(first, 2),
         "step_s": round(statistics.median(times), 4),
@@ -108,6 +120,7 @@ def main() -> int:
     parser.add_argument("--profile", default="paper")
     parser.add_argument("--dtypes", nargs="+", default=["float32"])
     parser.add_argument("--device", default=None)
+    parser.add_argument("--threads", type=int, default=None, help="as in training")
     parser.add_argument("--steps", type=int, default=6, help="steps timed after the first")
     parser.add_argument("--batch-size", type=int, default=16)
     parser.add_argument("--batch-length", type=int, default=64)
@@ -117,7 +130,7 @@ def main() -> int:
     batch = {"batch_size": options.batch_size, "batch_length": options.batch_length}
     if options.case:
         case = (options.backends[0], options.sizes[0], options.observations[0], options.profile, options.dtypes[0], options.device)
-        print(json.dumps(measure(*case, options.steps, **batch)))
+        print(json.dumps(measure(*case, options.steps, options.threads, **batch)))
         return 0
     machine = describe() | {"numpy_gflops": round(matrix_rate(), 1)}
     print(json.dumps(machine))
@@ -130,6 +143,7 @@ def main() -> int:
                     names = ["--backends", backend, "--sizes", size, "--observations", observation, "--dtypes", dtype]
                     sizes = [f"--{key.replace('_', '-')}={value}" for key, value in batch.items()]
                     where = ["--device", options.device] if options.device else []
+                    where += [f"--threads={options.threads}"] if options.threads else []
                     result = run_case([*names, *sizes, *where, "--profile", options.profile, "--steps", str(options.steps)])
                     results.append({"backend": backend, "size": size, "observation": observation, "dtype": dtype} | result)
                     print_row(results[-1])

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import math
+import os
 import re
 from collections.abc import Mapping
 from typing import Any
@@ -24,16 +25,28 @@ class Learner:
     """An agent on one device.
 
     seed: of the initial parameters. device: see `select_device`. nonfinite: "stop" or "skip", [LOOP-40] to [LOOP-42].
+    threads: that compute on the CPU, in the whole process; counts only before JAX has begun to use a device. None leaves them as they are.
 
     Raises:
       ValueError: an unknown device, or one that this installation of JAX does not have, or another word for `nonfinite`.
     """
 
-    def __init__(self, spaces: Spaces, config: Config, *, seed: int, device: str | None = None, nonfinite: str = "stop") -> None:
+    def __init__(
+        self,
+        spaces: Spaces,
+        config: Config,
+        *,
+        seed: int,
+        device: str | None = None,
+        nonfinite: str = "stop",
+        threads: int | None = None,
+    ) -> None:
         require(nonfinite in ("stop", "skip"), "nonfinite", "'stop' or 'skip'", nonfinite)
         if config.compute_dtype == "float64":
             jax.config.update("jax_enable_x64", True)
         self.spaces, self.config, self._nonfinite = spaces, config, nonfinite
+        if threads:
+            os.environ["NPROC"] = str(threads)  # XLA has no other way to say it; it looks when it makes the client of the CPU.
         self._device = select_device(device)
         self.device = ":".join([self._device.platform, *(device or "").split(":")[1:]])
         with jax.default_device(self._device):

@@ -1,6 +1,5 @@
 """What training talks to: one agent and its optimizer on one device. Interface: train/backend.py."""
 
-import os
 import re
 from collections.abc import Mapping
 from typing import Any
@@ -19,31 +18,34 @@ from spec import Config, Discrete, Spaces, parameter_table
 
 Arrays = Mapping[str, np.ndarray]
 
-# Up to this many recurrent units one thread is as fast as several on a quiet machine, and many times as fast on a busy one, where each of
-# the thousands of small operations of a step would wait for the slowest thread. Convolutions have enough work for all.
-SMALL = 256
-_THREADS = torch.get_num_threads()  # as the process came
-
 
 class Learner:
     """One agent.
 
     All of its state lies in a few flat buffers that a train step changes in place. seed: of the initial parameters. nonfinite: "stop" or
-    "skip", [LOOP-40] to [LOOP-42].
+    "skip", [LOOP-40] to [LOOP-42]. threads: that compute on the CPU, in the whole process; None leaves them as they are.
 
     Raises:
       ValueError: a device that is unknown or not there, or another word for `nonfinite`.
     """
 
-    def __init__(self, spaces: Spaces, config: Config, *, seed: int, device: str | None = None, nonfinite: str = "stop") -> None:
+    def __init__(
+        self,
+        spaces: Spaces,
+        config: Config,
+        *,
+        seed: int,
+        device: str | None = None,
+        nonfinite: str = "stop",
+        threads: int | None = None,
+    ) -> None:
         expect(nonfinite in ("stop", "skip"), "nonfinite", "'stop' or 'skip'", nonfinite)
         self._nonfinite, self._stopped = nonfinite, False
         self.spaces, self.config = spaces, config
         self._device = select_device(device)
         self.device = str(self._device)
-        if self._device.type == "cpu" and "OMP_NUM_THREADS" not in os.environ:
-            # The count holds for the whole process: a larger model made after a small one must not stay on its one thread.
-            torch.set_num_threads(1 if config.deter <= SMALL and not spaces.images else _THREADS)
+        if threads:
+            torch.set_num_threads(threads)
         if self._device.type == "cuda":
             # [LAY-1]: TensorFloat-32 is not float32. Convolutions would use it unasked.
             torch.set_float32_matmul_precision("highest")

@@ -144,7 +144,16 @@ class FakeLearner:
     seeds: ClassVar[list[tuple[str, int]]] = []
     loss: ClassVar[float] = 1.0
 
-    def __init__(self, spaces: Spaces, config: Config, *, seed: int, device: str | None = None, nonfinite: str = "stop") -> None:
+    def __init__(
+        self,
+        spaces: Spaces,
+        config: Config,
+        *,
+        seed: int,
+        device: str | None = None,
+        nonfinite: str = "stop",
+        threads: int | None = None,
+    ) -> None:
         if device not in (None, "cpu"):
             raise ValueError(f"no device {device!r}; available: cpu")
         self.device = "cpu"

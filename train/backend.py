@@ -21,11 +21,21 @@ class Learner(Protocol):
 
     seed: of the initial parameters. nonfinite: "stop" or "skip", what follows a train step whose total loss or gradient norm is not finite.
     Either way it changes nothing ([LOOP-40]); after "stop" no later train step does, until `load_state_dict` ([LOOP-41]).
+    threads: that compute on the CPU; None leaves it to the library.
     """
 
     device: str
 
-    def __init__(self, spaces: Spaces, config: Config, *, seed: int, device: str | None = None, nonfinite: str = "stop") -> None: ...
+    def __init__(
+        self,
+        spaces: Spaces,
+        config: Config,
+        *,
+        seed: int,
+        device: str | None = None,
+        nonfinite: str = "stop",
+        threads: int | None = None,
+    ) -> None: ...
 
     def initial_carry(self, envs: int) -> Any:
         """The carry of `envs` environments before their first step; opaque to the caller."""

@@ -103,6 +103,9 @@ def build_parser() -> argparse.ArgumentParser:
     run.add_argument("--logdir", type=Path, metavar="DIR", help="metrics, checkpoint and picture (default runs/TASK-BACKEND-seedN)")
     run.add_argument("--device", metavar="NAME", help="cpu, gpu, cuda:1, ... (default: the backend's choice)")
     run.add_argument(
+        "--threads", type=_whole(1), metavar="N", help="that compute on the CPU (default: the cores, and one for small models in PyTorch)"
+    )
+    run.add_argument(
         "--resume",
         choices=RESUME,
         help="auto: continue the run in the log directory if there is one (default); never, must: or else an error",

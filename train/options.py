@@ -33,6 +33,7 @@ class Options:
     steps: int
     seed: int = 0
     device: str | None = None
+    threads: int | None = None
     action_repeat: int = 1
     image_size: int = 64
     eval_every: int = 0

@@ -9,7 +9,7 @@ import numpy as np
 
 from reference_numpy.training_loop import ReplayRatio, derive_seed
 from spec import Spaces, parameter_table
-from train import checkpoint, resume
+from train import checkpoint, resume, threads
 from train.about import write_about
 from train.backend import Learner, learner_class
 from train.checkpoint import Checkpoint
@@ -60,9 +60,10 @@ def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -
         record=_begin(options, envs, starts) if record is None else record,
         carry=agent.initial_carry(envs.count),
     )
+    used = _threads(options, envs.spaces)
     display.say(
-        f"{options.task}: {options.backend} on {run.learner.device}, {parameters:,} parameters, {envs.count} environments, "
-        f"seed {options.seed}; logs in {options.logdir}"
+        f"{options.task}: {options.backend} on {run.learner.device}, {used} {'thread' if used == 1 else 'threads'}, "
+        f"{parameters:,} parameters, {envs.count} environments, seed {options.seed}; logs in {options.logdir}"
     )
     if saved:
         resume.restore(run, saved, exactly=record is not None)
@@ -125,6 +126,7 @@ def _find_checkpoint(options: Options, display: Display) -> Checkpoint | None:
 
 
 def import_learner(backend: str) -> type[Learner]:
+    threads.spin_briefly()
     try:
         return learner_class(backend)
     except ModuleNotFoundError as error:
@@ -168,10 +170,19 @@ def _preflight(options: Options, spaces: Spaces, display: Display) -> "Report":
     return report
 
 
+def _threads(options: Options, spaces: Spaces) -> int:
+    return threads.choose(options.backend, options.config, spaces, options.threads)
+
+
 def make_learner(learner: type[Learner], options: Options, spaces: Spaces) -> Learner:
     try:
         return learner(
-            spaces, options.config, seed=derive_seed(options.seed, "parameters", 0), device=options.device, nonfinite=options.nonfinite
+            spaces,
+            options.config,
+            seed=derive_seed(options.seed, "parameters", 0),
+            device=options.device,
+            nonfinite=options.nonfinite,
+            threads=_threads(options, spaces),
         )
     except ValueError as error:  # Spaces and configuration have been checked: what is left is the device.
         raise UserError(f"the backend {options.backend} does not run with --device {options.device}: {error}") from error

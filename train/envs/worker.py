@@ -186,5 +186,5 @@ def _start_method() -> str:
     """Workers must not be forks of this process: a backend has threads in it."""
     if sys.platform == "win32":
         return "spawn"
-    multiprocessing.set_forkserver_preload(["train.envs"])
+    multiprocessing.set_forkserver_preload(["train.worker_threads", "train.envs"])  # In this order.
     return "forkserver"
