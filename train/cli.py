@@ -1,5 +1,8 @@
 """The command `train`: options in, a run out, and one line for every mistake that the user can mend."""
 
+from train import before_numpy  # noqa: F401
+
+# isort: split
 import argparse
 import importlib
 import math
@@ -103,7 +106,10 @@ def build_parser() -> argparse.ArgumentParser:
     run.add_argument("--logdir", type=Path, metavar="DIR", help="metrics, checkpoint and picture (default runs/TASK-BACKEND-seedN)")
     run.add_argument("--device", metavar="NAME", help="cpu, gpu, cuda:1, ... (default: the backend's choice)")
     run.add_argument(
-        "--threads", type=_whole(1), metavar="N", help="that compute on the CPU (default: the cores, and one for small models in PyTorch)"
+        "--threads",
+        type=_whole(1),
+        metavar="N",
+        help="that compute on the CPU (default: by backend, model size and cores; see docs/runs.md)",
     )
     run.add_argument(
         "--resume",
