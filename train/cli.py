@@ -2,18 +2,24 @@
 
 import argparse
 import importlib
+import importlib.util
 import math
+import re
+import shlex
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
 from spec import built_profiles, hyperparameters, profiles, sizes
 from train.commands import COMMANDS
 from train.errors import UserError
-from train.options import DEFAULT_PRESET, NONFINITE, PROCESSES, RESUME, Options, make_options, presets
+from train.machine import own_version
+from train.options import DEFAULT_PRESET, NONFINITE, PROCESSES, RESUME, Options, did_you_mean, make_options, presets
 from train.replay.layout import DETER_DTYPES
 
+BACKENDS = ("jax", "torch")
+USAGE = "train --backend {jax,torch} [options]\n       train COMMAND ... (train COMMAND --help says more)"
 DESCRIPTION = """Train a DreamerV3 agent.
 
   train --backend jax                                            the default task, in minutes
@@ -21,7 +27,9 @@ DESCRIPTION = """Train a DreamerV3 agent.
   train --backend jax --preset dmc_proprio --task dmc:cheetah-run    the paper's protocol
   train --backend jax --task my_module:make_env                  your own: a function that returns a gymnasium.Env
 
-The same command again continues the run in its log directory."""
+The same command again continues the run in its log directory. Commands for what it leaves there:
+
+""" + "\n".join(f"  train {name:8}{what}" for name, what in COMMANDS.items())
 
 GROUPS = {
     "general": "hyperparameters: batches",
@@ -37,29 +45,52 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command. Returns the exit code: 0, or 2 after a UserError, or 130 after Ctrl-C."""
     arguments = sys.argv[1:] if arguments is None else arguments
     try:
-        if arguments and arguments[0] in COMMANDS:
-            command = importlib.import_module(f"train.commands.{arguments[0]}")
-            return command.main(arguments[1:])
+        if arguments and not arguments[0].startswith("-"):
+            name = arguments[0]
+            if name not in COMMANDS:
+                raise UserError(f"unknown command {name!r}{did_you_mean(name, COMMANDS)} (see train --help)")
+            return importlib.import_module(f"train.commands.{name}").main(arguments[1:])
         options = parse(arguments)
         from train import loop  # Only now: `--help` and mistakes in options shall not wait for Gymnasium.
 
         return 0 if loop.run(options) else 130
     except UserError as error:
-        if error.details:
-            print(error.details.rstrip(), file=sys.stderr)
-        print(f"train: error: {' '.join(str(error).split())}", file=sys.stderr)
+        say_error(error)
         return 2
     except KeyboardInterrupt:
         return 130
+
+
+def say_error(error: UserError) -> None:
+    """The one line of a mistake that the user can mend, on stderr."""
+    if error.details:
+        print(error.details.rstrip(), file=sys.stderr)
+    print(f"train: error: {' '.join(str(error).split())}", file=sys.stderr)
 
 
 def parse(arguments: Sequence[str]) -> Options:
     """The options of a command line.
 
     Raises:
-      UserError: an unknown option, or a value that is not of its kind.
+      UserError: no backend, an unknown option, or a value that is not of its kind.
     """
-    values = vars(build_parser().parse_args([_with_dashes(argument) for argument in arguments]))
+    values = vars(build_parser().parse_args(arguments))
+    if values["backend"] is None:
+        backend = next((name for name in BACKENDS if importlib.util.find_spec(name)), BACKENDS[0])
+        what = "trains with these options" if arguments else "trains the default task"
+        raise UserError(
+            "--backend is missing, which says what trains: jax or torch. "
+            f"`{shlex.join(['train', '--backend', backend, *arguments])}` {what}; `train --help` lists commands and options"
+        )
+    return options_of(values)
+
+
+def options_of(values: Mapping[str, Any]) -> Options:
+    """The options of what the parser of `build_parser` has read: None for what was not given.
+
+    Raises:
+      UserError: a value that no run could have.
+    """
     given = {name: value for name, value in values.items() if value is not None}
     backend, preset = given.pop("backend"), given.pop("preset", None)
     overrides = {name: given.pop(name) for name in hyperparameters() if name in given}
@@ -67,7 +98,16 @@ def parse(arguments: Sequence[str]) -> Options:
 
 
 class Parser(argparse.ArgumentParser):
-    """Mistakes are UserErrors."""
+    """Mistakes are UserErrors. An option may be written with _ for -."""
+
+    def parse_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> Any:  # type: ignore[override]
+        arguments = [_with_dashes(argument) for argument in (sys.argv[1:] if args is None else args)]
+        values, unknown = self.parse_known_args(arguments, namespace)
+        if unknown:
+            name = unknown[0].partition("=")[0]
+            known = re.findall(r"(?<![\w-])--[a-z0-9-]+", self.format_help())
+            self.error(f"unknown option {name}{did_you_mean(name, known)}" if name.startswith("-") else f"unexpected {name!r}")
+        return values
 
     def error(self, message: str) -> NoReturn:
         raise UserError(f"{message} (see {self.prog} --help)")
@@ -80,13 +120,18 @@ class _Formatter(argparse.RawDescriptionHelpFormatter):
 
 def build_parser() -> argparse.ArgumentParser:
     """Every option without a default: what is not given comes from the preset, see train/options.py."""
-    parser = Parser(
-        prog="train", description=DESCRIPTION, formatter_class=_Formatter, usage="train --backend {jax,torch} [options]", allow_abbrev=False
-    )
+    parser = Parser(prog="train", description=DESCRIPTION, formatter_class=_Formatter, usage=USAGE, allow_abbrev=False)
+    parser.add_argument("--version", action="version", version=f"dreamer-spec {own_version()}")
+    add_options(parser)
+    return parser
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """The options of a run, for `train` and for `train resume`."""
     base = presets()["base"]
 
     run = parser.add_argument_group("run")
-    run.add_argument("--backend", choices=["jax", "torch"], required=True, help="which implementation trains")
+    run.add_argument("--backend", choices=BACKENDS, help="which implementation trains")
     run.add_argument("--preset", metavar="NAME", help=_preset_help())
     run.add_argument(
         "--task", metavar="SUITE:NAME", help="gym:ID, dmc:DOMAIN-TASK (vectors), dmc_vision:DOMAIN-TASK (images) or MODULE:CALLABLE"
@@ -113,7 +158,7 @@ def build_parser() -> argparse.ArgumentParser:
         help="after a loss or gradient that is not finite: stop, and save what `train inspect` shows (default), or skip the update",
     )
     run.add_argument(
-        "--no-preflight", dest="preflight", action="store_false", default=None, help="skip the check of the backend before training"
+        "--preflight", action=argparse.BooleanOptionalAction, help="--no-preflight: skip the check of the backend before training"
     )
 
     run.add_argument("--wandb", metavar="PROJECT", help="log to Weights & Biases too (pip install 'dreamer-spec[wandb]')")
@@ -130,11 +175,9 @@ def build_parser() -> argparse.ArgumentParser:
         "--env-failures", type=_whole(0), metavar="N", help="environments made anew, per 100,000 steps, that end the run (default 10)"
     )
     envs.add_argument(
-        "--no-restore-envs",
-        dest="restore_envs",
-        action="store_false",
-        default=None,
-        help="a resumed run begins new episodes; otherwise it repeats the actions of those under way, and continues exactly. "
+        "--restore-envs",
+        action=argparse.BooleanOptionalAction,
+        help="--no-restore-envs: a resumed run begins new episodes; otherwise it repeats the actions of those under way. "
         "For environments that must not or cannot repeat them",
     )
 
@@ -161,7 +204,6 @@ def build_parser() -> argparse.ArgumentParser:
         groups[entry["group"]].add_argument(
             f"--{name.replace('_', '-')}", dest=name, type=kind, metavar=metavar, choices=entry.get("choices"), help=_help(name, entry)
         )
-    return parser
 
 
 def _with_dashes(argument: str) -> str:

@@ -1,10 +1,11 @@
 """What a run is: its options, made of [base], a preset and the command line, later ones winning."""
 
 import dataclasses
+import difflib
 import functools
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -59,6 +60,12 @@ class Options:
         return run | config
 
 
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """; did you mean report? Empty if nothing that is known looks like it."""
+    close = difflib.get_close_matches(word, known, n=1)
+    return f"; did you mean {close[0]}?" if close else ""
+
+
 @functools.cache
 def presets() -> dict[str, dict[str, Any]]:
     """Name -> settings of presets.toml, [base] included."""
@@ -73,7 +80,7 @@ def make_options(backend: str, given: Mapping[str, Any], hyperparameters: Mappin
     """
     known = [name for name in presets() if name != "base"]
     if preset is not None and preset not in known:
-        raise UserError(f"unknown preset {preset!r}; known: {', '.join(known)}")
+        raise UserError(f"unknown preset {preset!r}{did_you_mean(preset, known)}; known: {', '.join(known)}")
     if preset is None and "task" not in given:
         preset = DEFAULT_PRESET
     chosen = presets()[preset] if preset else {}

@@ -2,7 +2,9 @@
 
 import functools
 import math
+import os
 from contextlib import ExitStack, closing
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,7 +30,10 @@ if TYPE_CHECKING:
 def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -> Run:
     """Everything that can go wrong is tried here, the cheap things first. What must be closed is left to the stack."""
     _require_trainable(options)
-    _hold_logdir(options, stack)
+    is_new = not options.logdir.exists()
+    _require_place(options.logdir)
+    if not is_new:
+        _hold_logdir(options, stack)
     display = stack.enter_context(Display(options.steps))
     saved = _find_checkpoint(options, display)
     learner_type = learner or import_learner(options.backend)
@@ -38,6 +43,10 @@ def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -
     parameters = _count_parameters(options, envs.spaces)
     agent = make_learner(learner_type, options, envs.spaces)  # Before preflight: it says what is wrong with the device.
     report = _preflight(options, envs.spaces, display) if options.preflight else None
+    if is_new:  # Only now: what was mistyped leaves no directory behind.
+        _hold_logdir(options, stack)
+        if resume.find(options, display):
+            raise UserError(f"another process has begun a run in {options.logdir} meanwhile; the same command continues it")
     replay, saved, record = _open_replay(options, saved, envs, display)
     starts, step = _progress(options, saved)
     about = write_about(
@@ -82,6 +91,17 @@ def _progress(options: Options, saved: Checkpoint | None) -> tuple[int, int]:
 def _begin(options: Options, envs: Environments, starts: int) -> Record:
     """The first records of new episodes everywhere: [LOOP-25]."""
     return envs.reset([derive_seed(options.seed, "environment", worker + envs.count * starts) for worker in range(envs.count)])
+
+
+def _require_place(logdir: Path) -> None:
+    """Raises:
+    UserError: the log directory is not there and cannot be made.
+    """
+    place = next(path for path in (logdir, *logdir.absolute().parents) if path.exists())
+    if not place.is_dir() or not os.access(place, os.W_OK | os.X_OK):
+        raise UserError(
+            f"cannot write to the log directory {logdir}: {place} is no directory that can be written to; choose another with --logdir"
+        )
 
 
 def _hold_logdir(options: Options, stack: ExitStack) -> None:
