@@ -15,7 +15,7 @@ from spec import built_profiles, hyperparameters, profiles, sizes
 from train.commands import COMMANDS
 from train.errors import UserError
 from train.machine import own_version
-from train.options import DEFAULT_PRESET, NONFINITE, PROCESSES, RESUME, Options, did_you_mean, make_options, presets
+from train.options import DEFAULT_PRESET, NONFINITE, PROCESSES, RESUME, Options, did_you_mean, make_options, of_seeds, presets
 from train.replay.layout import DETER_DTYPES
 
 BACKENDS = ("jax", "torch")
@@ -50,10 +50,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if name not in COMMANDS:
                 raise UserError(f"unknown command {name!r}{did_you_mean(name, COMMANDS)} (see train --help)")
             return importlib.import_module(f"train.commands.{name}").main(arguments[1:])
-        options = parse(arguments)
-        from train import loop  # Only now: `--help` and mistakes in options shall not wait for Gymnasium.
+        runs = parse_runs(arguments)
+        from train import loop, seeds  # Only now: `--help` and mistakes in options shall not wait for Gymnasium.
 
-        return 0 if loop.run(options) else 130
+        if len(runs) > 1:
+            return seeds.run_all(runs, loop.run)
+        return 0 if loop.run(runs[0]) else 130
     except UserError as error:
         say_error(error)
         return 2
@@ -69,7 +71,17 @@ def say_error(error: UserError) -> None:
 
 
 def parse(arguments: Sequence[str]) -> Options:
-    """The options of a command line.
+    """The options of a command line that is one run.
+
+    Raises:
+      UserError: as `parse_runs`.
+    """
+    (options,) = parse_runs(arguments)
+    return options
+
+
+def parse_runs(arguments: Sequence[str]) -> list[Options]:
+    """The options of a command line, one of each seed.
 
     Raises:
       UserError: no backend, an unknown option, or a value that is not of its kind.
@@ -82,7 +94,12 @@ def parse(arguments: Sequence[str]) -> Options:
             "--backend is missing, which says what trains: jax or torch. "
             f"`{shlex.join(['train', '--backend', backend, *arguments])}` {what}; `train --help` lists commands and options"
         )
-    return options_of(values)
+    seeds, single = values.pop("seeds"), values["seed"]
+    if seeds is None:
+        return [options_of(values)]
+    if single is not None:
+        raise UserError(f"--seed {single} and --seeds were given: one of them is enough")
+    return of_seeds(options_of(values), seeds, values["logdir"] is not None)
 
 
 def options_of(values: Mapping[str, Any]) -> Options:
@@ -145,7 +162,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     run.add_argument("--steps", type=_whole(1), metavar="N", help=f"environment steps, with action repeat (default {base['steps']:,})")
     run.add_argument("--seed", type=_whole(0), metavar="N", help="seed of everything random (default 0)")
+    run.add_argument(
+        "--seeds", type=_seeds, metavar="N-M,...", help="several runs, one after the other: 0-4 or 0,2,5; with --logdir, in DIR/seedN"
+    )
     run.add_argument("--logdir", type=Path, metavar="DIR", help="metrics, checkpoint and picture (default runs/TASK-BACKEND-seedN)")
+    run.add_argument(
+        "--from", dest="from_", type=Path, metavar="RUN", help="a new run begins with the parameters of this one, or of a checkpoint"
+    )
     run.add_argument("--device", metavar="NAME", help="cpu, gpu, cuda:1, ... (default: the backend's choice)")
     run.add_argument(
         "--resume",
@@ -289,6 +312,20 @@ def _boolean(text: str) -> bool:
 
 def _numbers(text: str) -> list[int]:
     return [_whole()(part) for part in text.split(",")]
+
+
+def _seeds(text: str) -> list[int]:
+    """0-2,5 -> [0, 1, 2, 5]"""
+    seeds: list[int] = []
+    for part in text.split(","):
+        ends = re.fullmatch(r"([0-9]{1,15})(?:-([0-9]{1,15}))?", part.strip())
+        first, last = (int(ends[1]), int(ends[2] or ends[1])) if ends else (0, -1)
+        if not first <= last < first + 1000:
+            raise argparse.ArgumentTypeError(f"{text!r} is no list of seeds such as 0-4 or 0,2,5, of at most 1,000")
+        seeds += range(first, last + 1)
+    if len(set(seeds)) < len(seeds):
+        raise argparse.ArgumentTypeError(f"{text!r} names a seed twice")
+    return seeds
 
 
 if __name__ == "__main__":

@@ -20,8 +20,11 @@ from train.errors import UserError
 from train.evaluation import play_randomly
 from train.logger import Display, Logger
 from train.options import Options
+from train.outcome import mean_of
 from train.replay import Prefetcher, Replay, erase
+from train.schedule import say_outlook
 from train.state import Counters, Run, Scores
+from train.warm_start import begin_from, require_same_origin
 
 if TYPE_CHECKING:
     from conformance.preflight import Report
@@ -40,17 +43,27 @@ def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -
     envs, test_envs = _make_environments(options, stack)
     if saved:
         checkpoint.require_same_spaces(saved, envs.spaces.to_json())
+        require_same_origin(options)
     parameters = _count_parameters(options, envs.spaces)
     agent = make_learner(learner_type, options, envs.spaces)  # Before preflight: it says what is wrong with the device.
-    report = _preflight(options, envs.spaces, display) if options.preflight else None
+    origin = begin_from(options, agent, envs.spaces) if options.from_ and not saved else None
+    report = _preflight(options, envs.spaces, display) if options.preflight and _progress(options, saved)[1] < options.steps else None
     if is_new:  # Only now: what was mistyped leaves no directory behind.
         _hold_logdir(options, stack)
         if resume.find(options, display):
             raise UserError(f"another process has begun a run in {options.logdir} meanwhile; the same command continues it")
     replay, saved, record = _open_replay(options, saved, envs, display)
     starts, step = _progress(options, saved)
+    changed = resume.changes(saved, options) if saved else {}
     about = write_about(
-        options, spaces=envs.spaces, device=agent.device, parameters=parameters, preflight=report, resumed_at=step if saved else None
+        options,
+        spaces=envs.spaces,
+        device=agent.device,
+        parameters=parameters,
+        preflight=report,
+        resumed_at=step if saved else None,
+        given_anew=changed,
+        origin=origin,
     )
     logger = Logger(options.logdir, saved.info["log"] if saved else None, wandb=options.wandb, about=about)
     for line in logger.warnings:
@@ -73,11 +86,18 @@ def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -
         f"{options.task}: {options.backend} on {run.learner.device}, {parameters:,} parameters, {envs.count} environments, "
         f"seed {options.seed}; logs in {options.logdir}"
     )
+    if changed:
+        display.say(f"changed from here on: {'; '.join(f'{name} {before} -> {now}' for name, (before, now) in changed.items())}")
+    if origin:
+        display.say(
+            f"beginning with the parameters of {origin['checkpoint']} ({origin['task']}, step {origin['step']:,}), a fresh optimizer"
+        )
     if saved:
         resume.restore(run, saved, exactly=record is not None)
     else:
         _measure_random_policy(run)
     run.counters.starts += record is None
+    say_outlook(run)
     return run
 
 
@@ -242,6 +262,8 @@ def _measure_random_policy(run: Run) -> None:
     if run.options.random_episodes and run.test_envs:
         run.display.phase("a random policy plays")
         returns = play_randomly(run.test_envs, run.options.random_episodes, run.options.seed)
-        run.random_return = float(np.mean(returns))
-        run.logger.write(0, 0.0, {"random/return": run.random_return})
-        run.display.say(f"a random policy gets {run.random_return:.4g} (mean of {len(returns)} episodes)")
+        mean = mean_of(returns)
+        run.random_return = mean.value
+        error = {} if mean.error is None else {"random/return_standard_error": mean.error}
+        run.logger.write(0, 0.0, {"random/return": mean.value, **error})
+        run.display.say(f"a random policy gets {mean} (mean of {len(returns)} episodes)")

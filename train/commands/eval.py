@@ -19,7 +19,7 @@ from train.envs import Environments, Record, is_slow, make_env
 from train.errors import UserError, writing
 from train.evaluation import Agent, Episode, play_episodes, report_failures
 from train.logger import Display
-from train.options import Options
+from train.options import Options, names_code
 from train.saved_agent import SavedAgent, agent_of
 from train.setup import import_learner, make_learner
 
@@ -151,7 +151,6 @@ def _trained_last(saved: SavedAgent) -> str:
 def _task_without_code(saved: SavedAgent) -> str:
     """A checkpoint may come from anywhere, so it alone does not decide which modules are imported."""
     task: str = saved.info["task"]
-    suite, _, name = task.partition(":")
-    if suite in ("gym", "dmc", "dmc_vision") and ":" not in name:
+    if not names_code(task):
         return task
     raise UserError(f"the checkpoint names the task {task}, which runs code of that module; if you trust it, add --task {task}")
