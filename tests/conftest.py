@@ -11,6 +11,7 @@ from jax.experimental.compilation_cache import compilation_cache
 from train_fakes import FakeLearner
 from train_runs import SMALL, Make
 
+from spec import hyperparameters
 from train.options import Options, make_options
 
 
@@ -30,10 +31,7 @@ def make(tmp_path: Path) -> Iterator[Make]:
     FakeLearner.diary.clear()
 
     def options(**given: Any) -> Options:
-        overrides = {
-            **SMALL,
-            **{name: given.pop(name) for name in list(given) if name in SMALL or name in ("replay_ratio", "learning_rate")},
-        }
+        overrides = {**SMALL, **{name: given.pop(name) for name in list(given) if name in hyperparameters()}}
         plain = {"task": "train_fakes:Counting", "steps": 60, "logdir": tmp_path / "run", "preflight": False, "log_every": 0.0}
         plain["replay_deter"] = "float32"  # Latents say which call made them.
         return make_options("jax", {**plain, "eval_every": 0, "eval_episodes": 0, "random_episodes": 0, **given}, overrides)

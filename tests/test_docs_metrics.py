@@ -20,7 +20,7 @@ TINY = {
 
 
 def emitted(backend: str, logdir: Path) -> set[str]:
-    given = {"task": "gym:CartPole-v1", "logdir": logdir, "steps": 60, "eval_every": 30, "eval_episodes": 2, "random_episodes": 1}
+    given = {"task": "gym:CartPole-v1", "logdir": logdir, "steps": 60, "eval_every": 30, "eval_episodes": 2, "random_episodes": 2}
     settings = {**given, "size": "tiny", "preflight": False, "log_every": 0.0, "checkpoint_every": 0.0, "device": "cpu"}
     assert loop.run(make_options(backend, settings, TINY))
     lines = [line for line in iterate_metrics(logdir / "metrics.jsonl") if line is not None]

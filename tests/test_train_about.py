@@ -37,9 +37,9 @@ def test_the_command_gives_every_option() -> None:
     plain = make_options("jax", {"task": "my module:make_env"}, {})
     words = ["--task", "my module:make_env", "--learning-rate", "3e-5", "--cnn-multipliers", "2,2,4,4", "--cnn-outer", "false"]
     for action in build_parser()._actions:
-        if action.dest in ("help", "preset", "task") or action.dest in hyperparameters():
+        if action.dest in ("help", "version", "preset", "task", "seeds") or action.dest in hyperparameters():
             continue
-        words.append(action.option_strings[0])
+        words.append(action.option_strings[-1])  # --no-preflight of --preflight
         if action.nargs != 0:
             unusual = [choice for choice in action.choices or ["7"] if choice != getattr(plain, action.dest, "12m")]
             words.append(unusual[-1])

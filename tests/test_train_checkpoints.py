@@ -135,14 +135,14 @@ def test_another_backend_may_continue(make: Make, capsys: pytest.CaptureFixture[
 @pytest.mark.covers("LOOP-21")
 def test_another_configuration_is_refused_with_all_differences(make: Make) -> None:
     loop.run(make(), FakeLearner)
-    other = make(seed=1, learning_rate=1e-3, task="train_fakes:nan_observation")
+    other = make(seed=1, bins=51, task="train_fakes:nan_observation")
     with pytest.raises(UserError) as error:
         loop.run(other, FakeLearner)
     assert all(
         words in str(error.value)
         for words in (
             "seed: 0 in the checkpoint, 1 given",
-            "learning_rate: 4e-05 in the checkpoint, 0.001 given",
+            "bins: 255 in the checkpoint, 51 given",
             "task: train_fakes:Counting in the checkpoint, train_fakes:nan_observation given",
         )
     )

@@ -1,6 +1,8 @@
 """The command line of `train`: presets, hyperparameters, help, and one line with exit code 2 for each mistake."""
 
 import dataclasses
+import importlib.metadata
+import re
 import subprocess
 import sys
 import types
@@ -11,9 +13,11 @@ import numpy as np
 import pytest
 from train_fakes import FakeLearner
 
+import train.commands
 import train.setup
 from spec import benchmarks, hyperparameters, load_config
 from train.cli import build_parser, main, parse
+from train.commands import COMMANDS
 from train.errors import UserError
 from train.options import make_options, presets
 
@@ -57,7 +61,7 @@ def test_a_run_ends_with_its_result(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*FAST, "--task", "train_fakes:Counting"]) == 0
     out = capsys.readouterr().out
     assert "preflight: 3 checks" in out
-    assert out.splitlines()[-1] == "return 50, random 10, ratio 5.00"
+    assert out.splitlines()[-1] == "return 50, random 10, ratio 5 after 257 train steps"
     assert Path("runs/train_fakes-Counting-jax-seed0/curve.png").exists()
 
 
@@ -101,9 +105,9 @@ def test_missing_backend(capsys: pytest.CaptureFixture[str], monkeypatch: pytest
 
 def test_checkpoint_of_another_configuration(capsys: pytest.CaptureFixture[str]) -> None:
     main([*FAST, "--task", "train_fakes:Counting"])
-    line = refusal(capsys, *FAST, "--task", "train_fakes:Counting", "--learning-rate", "0.1", "--free-nats", "2")
-    assert "learning_rate: 4e-05 in the checkpoint, 0.1 given; " in line or "learning_rate: 4e-05 in the checkpoint, 0.1 given." in line
-    assert "free_nats: 1.0 in the checkpoint, 2.0 given" in line
+    line = refusal(capsys, *FAST, "--task", "train_fakes:Counting", "--units", "8", "--batch-length", "2", "--free-nats", "2")
+    assert "batch_length: 3 in the checkpoint, 2 given; units: 4 in the checkpoint, 8 given. These may not change half way" in line
+    assert "free_nats" not in line
 
 
 def test_unwritable_log_directory(capsys: pytest.CaptureFixture[str]) -> None:
@@ -230,3 +234,83 @@ def test_presets_of_the_papers_protocols_have_its_numbers(name: str) -> None:
     assert (options.steps, options.action_repeat) == (protocol["steps"], protocol["action_repeat"])
     assert (options.config.envs, options.config.replay_ratio) == (protocol["envs"], protocol["replay_ratio"])
     assert options.config == load_config("paper", protocol["size"], envs=protocol["envs"], replay_ratio=protocol["replay_ratio"])
+
+
+# Mistakes before there is a run
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], ["--backend is missing", "`train --backend jax` trains the default task", "train --help"]),
+        (["--task", "gym:A b", "--steps=9"], ["`train --backend jax --task 'gym:A b' --steps=9` trains with these options"]),
+        (["repot", "runs/a"], ["unknown command 'repot'; did you mean report?"]),
+        (["runs/a"], ["unknown command 'runs/a' (see train --help)"]),
+        (["--backend", "jax", "--learning-rat", "3"], ["unknown option --learning-rat; did you mean --learning-rate?"]),
+        (["--backend", "jax", "--batch_siz=3"], ["unknown option --batch-siz; did you mean --batch-size?"]),
+        (["--backend", "jax", "report"], ["unexpected 'report'"]),
+        (["eval", "runs/a", "--episode", "3"], ["unknown option --episode; did you mean --episodes? (see train eval --help)"]),
+        (["--backend", "jax", "--preset", "dmc_propio"], ["unknown preset 'dmc_propio'", "did you mean dmc_proprio?"]),
+    ],
+)
+def test_mistyped_words_are_told_what_is_close(capsys: pytest.CaptureFixture[str], arguments: list[str], words: list[str]) -> None:
+    line = refusal(capsys, *arguments)
+    assert all(word in line for word in words), line
+
+
+def test_help_names_the_commands_and_what_each_does(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    text = capsys.readouterr().out
+    for name, what in COMMANDS.items():
+        assert re.search(rf"^  train {name} +{re.escape(what)}$", text, re.MULTILINE), name
+    modules = {path.stem for path in Path(train.commands.__path__[0]).glob("*.py")} - {"__init__"}
+    assert modules == set(COMMANDS)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_has_its_help(capsys: pytest.CaptureFixture[str], name: str) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main([name, "--help"])
+    assert stop.value.code == 0
+    assert f"usage: train {name} " in capsys.readouterr().out
+
+
+def test_the_version(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["--version"])
+    assert stop.value.code == 0
+    assert capsys.readouterr().out == f"dreamer-spec {importlib.metadata.version('dreamer-spec')}\n"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["--task", "gym:NoSuchGame-v0"],
+        ["--task", "train_fakes:Sequences"],
+        ["--task", "train_fakes:Counting", "--device", "quantum:0"],
+        ["--task", "train_fakes:Everything", "--image-size", "50"],
+        ["--task", "train_fakes:Counting", "--replay-capacity", "5"],
+        ["--task", "train_fakes:Counting", "--resume", "must"],
+    ],
+)
+def test_what_was_mistyped_leaves_no_log_directory(capsys: pytest.CaptureFixture[str], arguments: list[str]) -> None:
+    refusal(capsys, *FAST, *arguments)
+    assert list(Path().iterdir()) == []
+
+
+def test_a_failed_preflight_leaves_no_log_directory(capsys: pytest.CaptureFixture[str], fakes: Report) -> None:
+    fakes.passed = False
+    refusal(capsys, *FAST, "--task", "train_fakes:Counting")
+    assert list(Path().iterdir()) == []
+
+
+def test_a_run_that_another_process_began_meanwhile_stays(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Between the look at the log directory and its lock."""
+    main([*FAST, "--task", "train_fakes:Counting"])
+    before = sorted(Path("runs").rglob("*"))
+    exists = Path.exists
+    monkeypatch.setattr(Path, "exists", lambda path, **given: exists(path, **given) and path.name != "train_fakes-Counting-jax-seed0")
+    line = refusal(capsys, *FAST, "--task", "train_fakes:Counting")
+    assert "another process has begun a run in runs/train_fakes-Counting-jax-seed0 meanwhile" in line
+    assert sorted(Path("runs").rglob("*")) == before

@@ -175,7 +175,7 @@ def test_metrics_curve_and_last_words(make: Make, capsys: pytest.CaptureFixture[
     assert [line["step"] for line in lines] == sorted(line["step"] for line in lines)
     assert (options.logdir / "curve.png").read_bytes().startswith(b"\x89PNG")
     assert list(options.logdir.glob("events.out.tfevents.*"))
-    assert capsys.readouterr().out.splitlines()[-1] == "return 50, random 10, ratio 5.00"
+    assert capsys.readouterr().out.splitlines()[-1] == "return 50 ± 0, random 10 ± 0, ratio 5 ± 0 after 257 train steps"
 
 
 @pytest.mark.parametrize(("episodes", "error"), [(3, 40 / 3), (1, None)])

@@ -123,7 +123,7 @@ def test_what_cannot_be_evaluated_is_named(counting: str, tmp_path: Path, capsys
     assert "Discrete(classes=(2,))" in message
     assert "Vector(size=2)" in message
     assert "expected at least one episode" in refusal(capsys, counting, "--episodes", "0")
-    assert "see train eval --help" in refusal(capsys, counting)
+    assert "see train eval --help" in refusal(capsys, counting, "--nonsense")
     assert "no checkpoint in" in refusal(capsys, str(tmp_path / "nowhere"), "--episodes", "1")
     assert "no device 'tpu9'" in refusal(capsys, counting, *COUNT, "1", "--device", "tpu9").replace("unknown", "no")
     strange = save_checkpoint(tmp_path / "strange", CONFIG, COUNTING, task="train_fakes:Counting", backend="os")

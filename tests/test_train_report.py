@@ -213,6 +213,19 @@ def test_log_directories_are_found_below_a_directory_and_once(tmp_path: Path) ->
     assert find_logdirs([b, tmp_path / "a", a]) == [b, a]
 
 
+def test_paths_without_a_run_are_named_and_left_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As `runs/*` gives them: what a failed start has left, and files beside the runs."""
+    make_run(tmp_path / "a", [{"step": 1}], task="t")
+    (tmp_path / "typo").mkdir()
+    (tmp_path / "typo" / ".lock").touch()
+    (tmp_path / "notes.txt").touch()
+    paths = sorted(map(str, tmp_path.iterdir()))
+    assert main(["report", *paths, "--out", str(tmp_path / "page.html")]) == 0
+    out = capsys.readouterr().out.splitlines()
+    assert out[:-1] == [f"{tmp_path / name} holds no run and is left out" for name in ("notes.txt", "typo")]
+    assert "1 run," in out[-1]
+
+
 def test_the_checkpoints_of_a_run_are_no_runs(tmp_path: Path) -> None:
     checkpoint.save(tmp_path, 9, {}, {}, {}, keep=1)
     for path in (tmp_path / "checkpoints", tmp_path / "checkpoints" / "000000000009"):
@@ -404,7 +417,7 @@ def test_the_command_writes_the_page(tmp_path: Path, capsys: pytest.CaptureFixtu
     ("arguments", "message"),
     [
         (["report"], "required: LOGDIR"),
-        (["report", "{}/missing"], "missing is not a directory; expected a log directory"),
+        (["report", "{}/missing"], "missing is not there; expected a log directory"),
         (["report", "{}"], "holds no run: neither metrics.jsonl nor run.json"),
         (["report", "{}/run", "--out", "{}/no/page.html"], "choose another file with --out"),
     ],

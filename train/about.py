@@ -6,6 +6,7 @@ import json
 import os
 import secrets
 import shlex
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,13 +26,22 @@ About = dict[str, Any]
 
 
 def write_about(
-    options: Options, *, spaces: Spaces, device: str, parameters: int, preflight: "Report | None", resumed_at: int | None
+    options: Options,
+    *,
+    spaces: Spaces,
+    device: str,
+    parameters: int,
+    preflight: "Report | None",
+    resumed_at: int | None,
+    given_anew: Mapping[str, Any] | None = None,
+    origin: Mapping[str, Any] | None = None,
 ) -> About:
     """Writes LOGDIR/run.json, complete or not at all, and returns what stands there.
 
     device: as the learner names it. parameters: how many numbers are trained. preflight: its result, None if it was skipped. resumed_at:
-    the environment step of the checkpoint that is continued, None for a new run. A resumed run keeps its `id` and its earlier `starts`;
-    all else describes this start.
+    the environment step of the checkpoint that is continued, None for a new run. given_anew: name -> [value before, value from here on] of
+    what a resumed run was given anew. origin: where the parameters of a new run come from, if not from its seed. A resumed run keeps its
+    `id`, its `origin` and its earlier `starts`; all else describes this start.
 
     Raises:
       UserError: the disk refuses it.
@@ -42,6 +52,7 @@ def write_about(
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     start = {"time": now, "step": resumed_at or 0, "backend": options.backend, "device": device}
     start |= {name: machine[name] for name in ("accelerator", "python", "versions", "commit")}
+    start["changed"] = dict(given_anew or {})
     known, starts = earlier.get("id"), earlier.get("starts")
     about = {
         "format": FORMAT,
@@ -53,7 +64,8 @@ def write_about(
         "profile": profile,
         "size": size,
         "parameters": parameters,
-        "options": _options(options),
+        "origin": earlier.get("origin") if resumed_at is not None else origin,
+        "options": options_json(options),
         "hyperparameters": dataclasses.asdict(options.config),
         "changed_hyperparameters": changed,
         "spaces": spaces.to_json(),
@@ -84,7 +96,7 @@ def command_line(options: Options) -> list[str]:
         value = getattr(options, field.name)
         if field.name in ("backend", "task", "config") or value == defaults[field.name]:
             continue
-        flag = field.name.replace("_", "-")
+        flag = field.name.rstrip("_").replace("_", "-")
         if isinstance(value, bool):
             words.append(f"--{flag}" if value else f"--no-{flag}")
         else:
@@ -106,7 +118,7 @@ def nearest(config: Config) -> tuple[str, str, dict[str, Any]]:
     return min(candidates, key=lambda candidate: len(candidate[2]))
 
 
-def _options(options: Options) -> dict[str, Any]:
+def options_json(options: Options) -> dict[str, Any]:
     """All but the hyperparameters, in plain JSON types."""
     values = {field.name: getattr(options, field.name) for field in dataclasses.fields(options) if field.name != "config"}
     return {name: str(value) if isinstance(value, Path) else value for name, value in values.items()}

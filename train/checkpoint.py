@@ -21,6 +21,7 @@ from safetensors.numpy import save_file
 
 from train.errors import UserError
 from train.files import SUMS, Arrays, flush, read_arrays, read_json, require_intact, seal
+from train.options import may_change
 
 FORMAT = 3
 OURS = re.compile(r"\d{12}(\.tmp|\.old)?")  # .tmp: being written; .old: about to be replaced by the same step
@@ -127,28 +128,38 @@ def open_checkpoint(path: Path) -> Checkpoint:
 
 def require_same_identity(checkpoint: Checkpoint, given: Mapping[str, Any]) -> None:
     """Raises:
-    UserError: the checkpoint is of another configuration; the message lists name, value in the checkpoint, value given.
+    UserError: the checkpoint is of another configuration; the message lists name, value in the checkpoint, value given. What may change
+    when a run is continued is not compared: [LOOP-70].
     """
-    _require_same(checkpoint, checkpoint.info["identity"], given)
+    saved = checkpoint.info["identity"]
+    _require_same(checkpoint, *({name: value for name, value in one.items() if name not in may_change()} for one in (saved, given)))
 
 
 def require_same_spaces(checkpoint: Checkpoint, given: Mapping[str, Any]) -> None:
     """Raises:
     UserError: the task's spaces are not those of the checkpoint; the message lists them.
     """
-    _require_same(checkpoint, _entries(checkpoint.info["spaces"]), _entries(given))
+    _require_same(checkpoint, space_entries(checkpoint.info["spaces"]), space_entries(given))
 
 
 def _require_same(checkpoint: Checkpoint, saved: Mapping[str, Any], given: Mapping[str, Any]) -> None:
-    given = json.loads(json.dumps(given))  # Tuples become lists, as in the file.
-    names = [name for name in {**saved, **given} if saved.get(name) != given.get(name)]
-    if names:
-        differences = "; ".join(f"{name}: {_show(saved.get(name))} in the checkpoint, {_show(given.get(name))} given" for name in names)
+    found = differences(saved, given)
+    if found:
         logdir = checkpoint.path.parent.parent
-        raise UserError(f"{logdir} holds a run of another configuration: {differences}. Give the same options, or another --logdir")
+        raise UserError(
+            f"{logdir} holds a run of another configuration: {'; '.join(found)}. These may not change half way: give the same options, or "
+            "another --logdir"
+        )
 
 
-def _entries(spaces: Mapping[str, Any]) -> dict[str, Any]:
+def differences(saved: Mapping[str, Any], given: Mapping[str, Any]) -> list[str]:
+    """A text for each name whose value in a checkpoint is not the given one."""
+    saved, given = json.loads(json.dumps([saved, given]))  # Tuples become lists, as in the file.
+    names = [name for name in {**saved, **given} if saved.get(name) != given.get(name)]
+    return [f"{name}: {_show(saved.get(name))} in the checkpoint, {_show(given.get(name))} given" for name in names]
+
+
+def space_entries(spaces: Mapping[str, Any]) -> dict[str, Any]:
     """observations: {x: ...} -> "observations x": ..., so that a difference names one key."""
     return {f"{kind} {key}": entry for kind, entries in spaces.items() for key, entry in entries.items()}
 

@@ -5,18 +5,24 @@ from train import before_numpy  # noqa: F401
 # isort: split
 import argparse
 import importlib
+import importlib.util
 import math
+import re
+import shlex
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
 from spec import built_profiles, hyperparameters, profiles, sizes
 from train.commands import COMMANDS
 from train.errors import UserError
-from train.options import DEFAULT_PRESET, NONFINITE, PROCESSES, RESUME, Options, make_options, presets
+from train.machine import own_version
+from train.options import DEFAULT_PRESET, NONFINITE, PROCESSES, RESUME, Options, did_you_mean, make_options, of_seeds, presets
 from train.replay.layout import DETER_DTYPES
 
+BACKENDS = ("jax", "torch")
+USAGE = "train --backend {jax,torch} [options]\n       train COMMAND ... (train COMMAND --help says more)"
 DESCRIPTION = """Train a DreamerV3 agent.
 
   train --backend jax                                            the default task, in minutes
@@ -24,7 +30,9 @@ DESCRIPTION = """Train a DreamerV3 agent.
   train --backend jax --preset dmc_proprio --task dmc:cheetah-run    the paper's protocol
   train --backend jax --task my_module:make_env                  your own: a function that returns a gymnasium.Env
 
-The same command again continues the run in its log directory."""
+The same command again continues the run in its log directory. Commands for what it leaves there:
+
+""" + "\n".join(f"  train {name:8}{what}" for name, what in COMMANDS.items())
 
 GROUPS = {
     "general": "hyperparameters: batches",
@@ -40,29 +48,69 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command. Returns the exit code: 0, or 2 after a UserError, or 130 after Ctrl-C."""
     arguments = sys.argv[1:] if arguments is None else arguments
     try:
-        if arguments and arguments[0] in COMMANDS:
-            command = importlib.import_module(f"train.commands.{arguments[0]}")
-            return command.main(arguments[1:])
-        options = parse(arguments)
-        from train import loop  # Only now: `--help` and mistakes in options shall not wait for Gymnasium.
+        if arguments and not arguments[0].startswith("-"):
+            name = arguments[0]
+            if name not in COMMANDS:
+                raise UserError(f"unknown command {name!r}{did_you_mean(name, COMMANDS)} (see train --help)")
+            return importlib.import_module(f"train.commands.{name}").main(arguments[1:])
+        runs = parse_runs(arguments)
+        from train import loop, seeds  # Only now: `--help` and mistakes in options shall not wait for Gymnasium.
 
-        return 0 if loop.run(options) else 130
+        if len(runs) > 1:
+            return seeds.run_all(runs, loop.run)
+        return 0 if loop.run(runs[0]) else 130
     except UserError as error:
-        if error.details:
-            print(error.details.rstrip(), file=sys.stderr)
-        print(f"train: error: {' '.join(str(error).split())}", file=sys.stderr)
+        say_error(error)
         return 2
     except KeyboardInterrupt:
         return 130
 
 
+def say_error(error: UserError) -> None:
+    """The one line of a mistake that the user can mend, on stderr."""
+    if error.details:
+        print(error.details.rstrip(), file=sys.stderr)
+    print(f"train: error: {' '.join(str(error).split())}", file=sys.stderr)
+
+
 def parse(arguments: Sequence[str]) -> Options:
-    """The options of a command line.
+    """The options of a command line that is one run.
 
     Raises:
-      UserError: an unknown option, or a value that is not of its kind.
+      UserError: as `parse_runs`.
     """
-    values = vars(build_parser().parse_args([_with_dashes(argument) for argument in arguments]))
+    (options,) = parse_runs(arguments)
+    return options
+
+
+def parse_runs(arguments: Sequence[str]) -> list[Options]:
+    """The options of a command line, one of each seed.
+
+    Raises:
+      UserError: no backend, an unknown option, or a value that is not of its kind.
+    """
+    values = vars(build_parser().parse_args(arguments))
+    if values["backend"] is None:
+        backend = next((name for name in BACKENDS if importlib.util.find_spec(name)), BACKENDS[0])
+        what = "trains with these options" if arguments else "trains the default task"
+        raise UserError(
+            "--backend is missing, which says what trains: jax or torch. "
+            f"`{shlex.join(['train', '--backend', backend, *arguments])}` {what}; `train --help` lists commands and options"
+        )
+    seeds, single = values.pop("seeds"), values["seed"]
+    if seeds is None:
+        return [options_of(values)]
+    if single is not None:
+        raise UserError(f"--seed {single} and --seeds were given: one of them is enough")
+    return of_seeds(options_of(values), seeds, values["logdir"] is not None)
+
+
+def options_of(values: Mapping[str, Any]) -> Options:
+    """The options of what the parser of `build_parser` has read: None for what was not given.
+
+    Raises:
+      UserError: a value that no run could have.
+    """
     given = {name: value for name, value in values.items() if value is not None}
     backend, preset = given.pop("backend"), given.pop("preset", None)
     overrides = {name: given.pop(name) for name in hyperparameters() if name in given}
@@ -70,7 +118,16 @@ def parse(arguments: Sequence[str]) -> Options:
 
 
 class Parser(argparse.ArgumentParser):
-    """Mistakes are UserErrors."""
+    """Mistakes are UserErrors. An option may be written with _ for -."""
+
+    def parse_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> Any:  # type: ignore[override]
+        arguments = [_with_dashes(argument) for argument in (sys.argv[1:] if args is None else args)]
+        values, unknown = self.parse_known_args(arguments, namespace)
+        if unknown:
+            name = unknown[0].partition("=")[0]
+            known = re.findall(r"(?<![\w-])--[a-z0-9-]+", self.format_help())
+            self.error(f"unknown option {name}{did_you_mean(name, known)}" if name.startswith("-") else f"unexpected {name!r}")
+        return values
 
     def error(self, message: str) -> NoReturn:
         raise UserError(f"{message} (see {self.prog} --help)")
@@ -83,13 +140,18 @@ class _Formatter(argparse.RawDescriptionHelpFormatter):
 
 def build_parser() -> argparse.ArgumentParser:
     """Every option without a default: what is not given comes from the preset, see train/options.py."""
-    parser = Parser(
-        prog="train", description=DESCRIPTION, formatter_class=_Formatter, usage="train --backend {jax,torch} [options]", allow_abbrev=False
-    )
+    parser = Parser(prog="train", description=DESCRIPTION, formatter_class=_Formatter, usage=USAGE, allow_abbrev=False)
+    parser.add_argument("--version", action="version", version=f"dreamer-spec {own_version()}")
+    add_options(parser)
+    return parser
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """The options of a run, for `train` and for `train resume`."""
     base = presets()["base"]
 
     run = parser.add_argument_group("run")
-    run.add_argument("--backend", choices=["jax", "torch"], required=True, help="which implementation trains")
+    run.add_argument("--backend", choices=BACKENDS, help="which implementation trains")
     run.add_argument("--preset", metavar="NAME", help=_preset_help())
     run.add_argument(
         "--task", metavar="SUITE:NAME", help="gym:ID, dmc:DOMAIN-TASK (vectors), dmc_vision:DOMAIN-TASK (images) or MODULE:CALLABLE"
@@ -103,7 +165,13 @@ def build_parser() -> argparse.ArgumentParser:
     )
     run.add_argument("--steps", type=_whole(1), metavar="N", help=f"environment steps, with action repeat (default {base['steps']:,})")
     run.add_argument("--seed", type=_whole(0), metavar="N", help="seed of everything random (default 0)")
+    run.add_argument(
+        "--seeds", type=_seeds, metavar="N-M,...", help="several runs, one after the other: 0-4 or 0,2,5; with --logdir, in DIR/seedN"
+    )
     run.add_argument("--logdir", type=Path, metavar="DIR", help="metrics, checkpoint and picture (default runs/TASK-BACKEND-seedN)")
+    run.add_argument(
+        "--from", dest="from_", type=Path, metavar="RUN", help="a new run begins with the parameters of this one, or of a checkpoint"
+    )
     run.add_argument("--device", metavar="NAME", help="cpu, gpu, cuda:1, ... (default: the backend's choice)")
     run.add_argument(
         "--threads",
@@ -122,7 +190,7 @@ def build_parser() -> argparse.ArgumentParser:
         help="after a loss or gradient that is not finite: stop, and save what `train inspect` shows (default), or skip the update",
     )
     run.add_argument(
-        "--no-preflight", dest="preflight", action="store_false", default=None, help="skip the check of the backend before training"
+        "--preflight", action=argparse.BooleanOptionalAction, help="--no-preflight: skip the check of the backend before training"
     )
 
     run.add_argument("--wandb", metavar="PROJECT", help="log to Weights & Biases too (pip install 'dreamer-spec[wandb]')")
@@ -139,11 +207,9 @@ def build_parser() -> argparse.ArgumentParser:
         "--env-failures", type=_whole(0), metavar="N", help="environments made anew, per 100,000 steps, that end the run (default 10)"
     )
     envs.add_argument(
-        "--no-restore-envs",
-        dest="restore_envs",
-        action="store_false",
-        default=None,
-        help="a resumed run begins new episodes; otherwise it repeats the actions of those under way, and continues exactly. "
+        "--restore-envs",
+        action=argparse.BooleanOptionalAction,
+        help="--no-restore-envs: a resumed run begins new episodes; otherwise it repeats the actions of those under way. "
         "For environments that must not or cannot repeat them",
     )
 
@@ -170,7 +236,6 @@ def build_parser() -> argparse.ArgumentParser:
         groups[entry["group"]].add_argument(
             f"--{name.replace('_', '-')}", dest=name, type=kind, metavar=metavar, choices=entry.get("choices"), help=_help(name, entry)
         )
-    return parser
 
 
 def _with_dashes(argument: str) -> str:
@@ -256,6 +321,20 @@ def _boolean(text: str) -> bool:
 
 def _numbers(text: str) -> list[int]:
     return [_whole()(part) for part in text.split(",")]
+
+
+def _seeds(text: str) -> list[int]:
+    """0-2,5 -> [0, 1, 2, 5]"""
+    seeds: list[int] = []
+    for part in text.split(","):
+        ends = re.fullmatch(r"([0-9]{1,15})(?:-([0-9]{1,15}))?", part.strip())
+        first, last = (int(ends[1]), int(ends[2] or ends[1])) if ends else (0, -1)
+        if not first <= last < first + 1000:
+            raise argparse.ArgumentTypeError(f"{text!r} is no list of seeds such as 0-4 or 0,2,5, of at most 1,000")
+        seeds += range(first, last + 1)
+    if len(set(seeds)) < len(seeds):
+        raise argparse.ArgumentTypeError(f"{text!r} names a seed twice")
+    return seeds
 
 
 if __name__ == "__main__":

@@ -35,6 +35,11 @@ def accelerator() -> str | None:
     return (_output(command) or "").partition("\n")[0] or None
 
 
+def own_version() -> str:
+    """Of dreamer-spec; unknown where it was not installed."""
+    return _version("dreamer-spec") or "unknown"
+
+
 def _processor() -> str:
     try:
         with open("/proc/cpuinfo", encoding="utf-8") as file:

@@ -1,21 +1,23 @@
 """What a run is: its options, made of [base], a preset and the command line, later ones winning."""
 
 import dataclasses
+import difflib
 import functools
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from spec import Config, built_profiles, load_config
+from spec import Config, built_profiles, hyperparameters, load_config
 from train.errors import UserError
 
 DEFAULT_PRESET = "cartpole"
 RESUME = ("auto", "never", "must")
 PROCESSES = ("auto", "yes", "no")
 NONFINITE = ("stop", "skip")
+CHANGEABLE_GROUPS = ("world_model", "behavior", "optimizer")  # of spec/hyperparameters.toml: [LOOP-70]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,7 +25,7 @@ class Options:
     """Everything that a run depends on, beside the code.
 
     steps and eval_every are environment steps: records times action_repeat. checkpoint_every, log_every and env_timeout are seconds.
-    replay_memory is in GiB.
+    replay_memory is in GiB. from_: a log directory or a checkpoint, whose parameters a new run begins with.
     """
 
     backend: str
@@ -31,6 +33,7 @@ class Options:
     config: Config
     logdir: Path
     steps: int
+    from_: Path | None = None
     seed: int = 0
     device: str | None = None
     threads: int | None = None
@@ -54,10 +57,23 @@ class Options:
     preflight: bool = True
 
     def identity(self) -> dict[str, Any]:
-        """What a checkpoint must agree in to be continued. The backend is not in it: either continues what the other began."""
+        """What was learned depends on, the backend aside: either continues what the other began. See `may_change`."""
         run = {name: getattr(self, name) for name in ("task", "seed", "action_repeat", "image_size", "replay_deter")}
         config = {name: list(value) if isinstance(value, tuple) else value for name, value in dataclasses.asdict(self.config).items()}
         return run | config
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """; did you mean report? Empty if nothing that is known looks like it."""
+    close = difflib.get_close_matches(word, known, n=1)
+    return f"; did you mean {close[0]}?" if close else ""
+
+
+@functools.cache
+def may_change() -> frozenset[str]:
+    """The hyperparameters that may have another value when a run is continued: [LOOP-70]. Every other entry of `identity` must stay."""
+    entries = hyperparameters().items()
+    return frozenset({name for name, entry in entries if entry["group"] in CHANGEABLE_GROUPS} | {"replay_ratio"})
 
 
 @functools.cache
@@ -66,20 +82,20 @@ def presets() -> dict[str, dict[str, Any]]:
     return tomllib.loads(resources.files("train").joinpath("presets.toml").read_text(encoding="utf-8"))
 
 
-def make_options(backend: str, given: Mapping[str, Any], hyperparameters: Mapping[str, Any], preset: str | None = None) -> Options:
-    """The options of a run: `given` by name of the fields of Options, plus "profile" and "size"; hyperparameters by their names.
+def make_options(backend: str, given: Mapping[str, Any], changed: Mapping[str, Any], preset: str | None = None) -> Options:
+    """The options of a run: `given` by name of the fields of Options, plus "profile" and "size"; `changed` hyperparameters by their names.
 
     Raises:
       UserError: an unknown preset, profile, size or hyperparameter, a profile that is not for training, or a value that no run could have.
     """
     known = [name for name in presets() if name != "base"]
     if preset is not None and preset not in known:
-        raise UserError(f"unknown preset {preset!r}; known: {', '.join(known)}")
+        raise UserError(f"unknown preset {preset!r}{did_you_mean(preset, known)}; known: {', '.join(known)}")
     if preset is None and "task" not in given:
         preset = DEFAULT_PRESET
     chosen = presets()[preset] if preset else {}
     settings = {**presets()["base"], **chosen, **given}
-    overrides = {**chosen.get("hyperparameters", {}), **hyperparameters}
+    overrides = {**chosen.get("hyperparameters", {}), **changed}
     profile = settings.pop("profile")
     try:
         config = load_config(profile, settings.pop("size"), **overrides)
@@ -99,3 +115,18 @@ def default_logdir(task: str, backend: str, seed: int) -> Path:
     """runs/<task>-<backend>-seed<k>, the task without its suite and without characters that file systems dislike."""
     name = re.sub(r"[^A-Za-z0-9_.-]+", "-", task.removeprefix("gym:").replace(":", "-"))
     return Path("runs") / f"{name}-{backend}-seed{seed}"
+
+
+def of_seeds(options: Options, seeds: Sequence[int], logdir_given: bool) -> list[Options]:
+    """The options of each seed: in runs/TASK-BACKEND-seedN, or in seedN below the log directory that was given."""
+    runs = []
+    for seed in seeds:
+        logdir = options.logdir / f"seed{seed}" if logdir_given else default_logdir(options.task, options.backend, seed)
+        runs.append(dataclasses.replace(options, seed=seed, logdir=logdir))
+    return runs
+
+
+def names_code(task: str) -> bool:
+    """Whether a task is a module of somebody, whose code would run, and not one of a suite."""
+    suite, _, name = task.partition(":")
+    return suite not in ("gym", "dmc", "dmc_vision") or ":" in name

@@ -1,6 +1,7 @@
 """A run that is interrupted and continued: what a checkpoint holds, and how a run begins from one. [LOOP-21] to [LOOP-23]"""
 
 import dataclasses
+import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -8,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from train import checkpoint
+from train.about import options_json, read_about
 from train.checkpoint import Arrays, Checkpoint, Damaged
 from train.envs import Environments, History, Record
 from train.errors import UserError
@@ -17,6 +19,7 @@ from train.options import Options
 from train.state import Counters, Means, Run
 
 COUNTERS = {name: type(value) for name, value in dataclasses.asdict(Counters()).items()}
+NOT_CHANGES = ("backend", "device", "logdir", "resume", "preflight", "from_")  # each start says its own
 FROM_BOUNDARY = "new episodes begin, those under way when it was saved are abandoned"
 
 
@@ -78,6 +81,19 @@ def find(options: Options, display: Display) -> Checkpoint | None:
             f"{options.logdir} has damaged checkpoints only: {', '.join(map(str, damaged))}; to begin anew, choose another --logdir"
         )
     return None
+
+
+def changes(saved: Checkpoint, options: Options) -> dict[str, list[Any]]:
+    """What the run of a checkpoint is given anew: name -> [value before, value from here on]. [LOOP-70]
+
+    Of what a checkpoint does not hold, such as --steps, run.json says what it was.
+    """
+    about = read_about(options.logdir) or {}
+    earlier = about.get("options")
+    before = {**(earlier if isinstance(earlier, dict) else {}), **saved.info["identity"]}
+    now = json.loads(json.dumps({**options_json(options), **options.identity()}))  # Tuples become lists, as in the files.
+    names = [name for name in now if name in before and name not in NOT_CHANGES]
+    return {name: [before[name], now[name]] for name in names if before[name] != now[name]}
 
 
 def give_up(path: Path, error: Exception, display: Display) -> None:

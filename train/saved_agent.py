@@ -1,7 +1,6 @@
 """The agent of a checkpoint or a policy folder: what it is, read from files that nobody vouches for."""
 
 import dataclasses
-import importlib.metadata
 import platform
 from collections.abc import Mapping
 from typing import Any
@@ -13,6 +12,7 @@ from spec import Config, Parameter, Spaces, hyperparameters, load_config, parame
 from train.checkpoint import Checkpoint
 from train.errors import UserError
 from train.files import Arrays
+from train.machine import own_version
 
 INFO = {"task": str, "step": int, "backend": str, "action_repeat": int, "image_size": int, "source": dict, "versions": dict}
 MOST_LAYERS = 1000  # of a network: no description is believed that would need more memory than the parameters
@@ -114,8 +114,4 @@ def acting_table(config: Config, spaces: Spaces) -> dict[str, Parameter]:
 
 def versions() -> dict[str, str]:
     """Of what writes a policy now."""
-    try:
-        own = importlib.metadata.version("dreamer-spec")
-    except importlib.metadata.PackageNotFoundError:  # run from a clone
-        own = "unknown"
-    return {"dreamer-spec": own, "python": platform.python_version(), "numpy": np.__version__}
+    return {"dreamer-spec": own_version(), "python": platform.python_version(), "numpy": np.__version__}

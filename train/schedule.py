@@ -16,6 +16,7 @@ from train.errors import writing
 from train.evaluation import Agent, Interrupted, evaluate, report_failures
 from train.finite import finite_action, mean_metrics
 from train.logger import duration
+from train.outcome import first_train_step, last_words, next_commands, read_outcome, why_untrained
 from train.pictures import draw_predictions, prune_pictures
 from train.prediction import SequenceRecorder, predict, prediction_errors
 from train.state import Run
@@ -179,20 +180,18 @@ def finish(run: Run) -> None:
         f"{run.step:,} steps, {run.counters.train_steps:,} train steps and {run.counters.episodes:,} episodes in "
         f"{duration(run.counters.seconds)}; curve in {picture}"
     )
-    run.display.say(last_words(run))
+    if not run.counters.train_steps:
+        run.display.say(f"WARNING: no train step was made, the agent is as it began: {why_untrained(options)}")
+    run.display.say("next: " + "\n      ".join(next_commands(options, run.step)))
+    run.display.say(last_words(read_outcome(options.logdir), run.counters.train_steps))
 
 
-def last_words(run: Run) -> str:
-    """return 187.3, random 22.1, ratio 8.5"""
-    if run.evaluation:
-        result = run.evaluation["return"]
-    elif run.returns:
-        result = float(np.mean(run.returns))
-    else:
-        return "no episode has ended yet"
-    words = f"return {result:.4g}"
-    if run.random_return is not None:
-        words += f", random {run.random_return:.4g}"
-        if run.random_return > 0:
-            words += f", ratio {result / run.random_return:.2f}"
-    return words
+def say_outlook(run: Run) -> None:
+    """Says if there is nothing to train within --steps."""
+    options = run.options
+    if run.step >= options.steps:
+        run.display.say(
+            f"the run is at step {run.step:,} and --steps is {options.steps:,}: nothing is left to train; a larger --steps goes on"
+        )
+    elif not run.counters.train_steps and first_train_step(options) > options.steps:
+        run.display.say(f"WARNING: no train step will be made: {why_untrained(options)}")

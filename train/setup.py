@@ -2,7 +2,9 @@
 
 import functools
 import math
+import os
 from contextlib import ExitStack, closing
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,8 +20,11 @@ from train.errors import UserError
 from train.evaluation import play_randomly
 from train.logger import Display, Logger
 from train.options import Options
+from train.outcome import mean_of
 from train.replay import Prefetcher, Replay, erase
+from train.schedule import say_outlook
 from train.state import Counters, Run, Scores
+from train.warm_start import begin_from, require_same_origin
 
 if TYPE_CHECKING:
     from conformance.preflight import Report
@@ -28,20 +33,37 @@ if TYPE_CHECKING:
 def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -> Run:
     """Everything that can go wrong is tried here, the cheap things first. What must be closed is left to the stack."""
     _require_trainable(options)
-    _hold_logdir(options, stack)
+    is_new = not options.logdir.exists()
+    _require_place(options.logdir)
+    if not is_new:
+        _hold_logdir(options, stack)
     display = stack.enter_context(Display(options.steps))
     saved = _find_checkpoint(options, display)
     learner_type = learner or import_learner(options.backend)
     envs, test_envs = _make_environments(options, stack)
     if saved:
         checkpoint.require_same_spaces(saved, envs.spaces.to_json())
+        require_same_origin(options)
     parameters = _count_parameters(options, envs.spaces)
     agent = make_learner(learner_type, options, envs.spaces)  # Before preflight: it says what is wrong with the device.
-    report = _preflight(options, envs.spaces, display) if options.preflight else None
+    origin = begin_from(options, agent, envs.spaces) if options.from_ and not saved else None
+    report = _preflight(options, envs.spaces, display) if options.preflight and _progress(options, saved)[1] < options.steps else None
+    if is_new:  # Only now: what was mistyped leaves no directory behind.
+        _hold_logdir(options, stack)
+        if resume.find(options, display):
+            raise UserError(f"another process has begun a run in {options.logdir} meanwhile; the same command continues it")
     replay, saved, record = _open_replay(options, saved, envs, display)
     starts, step = _progress(options, saved)
+    changed = resume.changes(saved, options) if saved else {}
     about = write_about(
-        options, spaces=envs.spaces, device=agent.device, parameters=parameters, preflight=report, resumed_at=step if saved else None
+        options,
+        spaces=envs.spaces,
+        device=agent.device,
+        parameters=parameters,
+        preflight=report,
+        resumed_at=step if saved else None,
+        given_anew=changed,
+        origin=origin,
     )
     logger = Logger(options.logdir, saved.info["log"] if saved else None, wandb=options.wandb, about=about)
     for line in logger.warnings:
@@ -65,11 +87,18 @@ def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -
         f"{options.task}: {options.backend} on {run.learner.device}, {used} {'thread' if used == 1 else 'threads'}, "
         f"{parameters:,} parameters, {envs.count} environments, seed {options.seed}; logs in {options.logdir}"
     )
+    if changed:
+        display.say(f"changed from here on: {'; '.join(f'{name} {before} -> {now}' for name, (before, now) in changed.items())}")
+    if origin:
+        display.say(
+            f"beginning with the parameters of {origin['checkpoint']} ({origin['task']}, step {origin['step']:,}), a fresh optimizer"
+        )
     if saved:
         resume.restore(run, saved, exactly=record is not None)
     else:
         _measure_random_policy(run)
     run.counters.starts += record is None
+    say_outlook(run)
     return run
 
 
@@ -83,6 +112,17 @@ def _progress(options: Options, saved: Checkpoint | None) -> tuple[int, int]:
 def _begin(options: Options, envs: Environments, starts: int) -> Record:
     """The first records of new episodes everywhere: [LOOP-25]."""
     return envs.reset([derive_seed(options.seed, "environment", worker + envs.count * starts) for worker in range(envs.count)])
+
+
+def _require_place(logdir: Path) -> None:
+    """Raises:
+    UserError: the log directory is not there and cannot be made.
+    """
+    place = next(path for path in (logdir, *logdir.absolute().parents) if path.exists())
+    if not place.is_dir() or not os.access(place, os.W_OK | os.X_OK):
+        raise UserError(
+            f"cannot write to the log directory {logdir}: {place} is no directory that can be written to; choose another with --logdir"
+        )
 
 
 def _hold_logdir(options: Options, stack: ExitStack) -> None:
@@ -233,6 +273,8 @@ def _measure_random_policy(run: Run) -> None:
     if run.options.random_episodes and run.test_envs:
         run.display.phase("a random policy plays")
         returns = play_randomly(run.test_envs, run.options.random_episodes, run.options.seed)
-        run.random_return = float(np.mean(returns))
-        run.logger.write(0, 0.0, {"random/return": run.random_return})
-        run.display.say(f"a random policy gets {run.random_return:.4g} (mean of {len(returns)} episodes)")
+        mean = mean_of(returns)
+        run.random_return = mean.value
+        error = {} if mean.error is None else {"random/return_standard_error": mean.error}
+        run.logger.write(0, 0.0, {"random/return": mean.value, **error})
+        run.display.say(f"a random policy gets {mean} (mean of {len(returns)} episodes)")

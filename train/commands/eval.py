@@ -1,4 +1,4 @@
-"""`train eval CHECKPOINT --episodes N`: plays episodes with the agent of a checkpoint, on either backend."""
+"""`train eval CHECKPOINT`: plays episodes with the agent of a checkpoint, on either backend."""
 
 import argparse
 import functools
@@ -14,19 +14,18 @@ import numpy as np
 from reference_numpy.training_loop import derive_seed
 from train.backend import Learner
 from train.checkpoint import open_checkpoint
-from train.cli import Parser
+from train.cli import BACKENDS, Parser
 from train.envs import Environments, Record, is_slow, make_env
 from train.errors import UserError, writing
 from train.evaluation import Agent, Episode, play_episodes, report_failures
 from train.logger import Display
-from train.options import Options
+from train.options import Options, names_code
 from train.saved_agent import SavedAgent, agent_of
 from train.setup import import_learner, make_learner
 
-BACKENDS = ("jax", "torch")
 DESCRIPTION = """Play episodes with the agent of a checkpoint. It samples its actions, as in training.
 
-  train eval runs/CartPole-v1-jax-seed0 --episodes 100
+  train eval runs/CartPole-v1-jax-seed0
   train eval runs/CartPole-v1-jax-seed0/checkpoints/000000020000 --episodes 100 --backend torch --json returns.json"""
 
 
@@ -128,7 +127,7 @@ def sentence(summary: Mapping[str, float | None]) -> str:
 def _parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser = Parser(prog="train eval", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False)
     parser.add_argument("checkpoint", type=Path, help="a log directory (its newest checkpoint), or one of the folders in its checkpoints/")
-    parser.add_argument("--episodes", type=int, required=True, metavar="N", help="how many")
+    parser.add_argument("--episodes", type=int, default=10, metavar="N", help="how many (default 10)")
     parser.add_argument("--backend", choices=BACKENDS, help="which implementation acts (default: the one that trained last)")
     parser.add_argument("--device", metavar="NAME", help="cpu, gpu, cuda:1, ... (default: the backend's choice)")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of environments and actions; never those of the run (default 0)")
@@ -152,7 +151,6 @@ def _trained_last(saved: SavedAgent) -> str:
 def _task_without_code(saved: SavedAgent) -> str:
     """A checkpoint may come from anywhere, so it alone does not decide which modules are imported."""
     task: str = saved.info["task"]
-    suite, _, name = task.partition(":")
-    if suite in ("gym", "dmc", "dmc_vision") and ":" not in name:
+    if not names_code(task):
         return task
     raise UserError(f"the checkpoint names the task {task}, which runs code of that module; if you trust it, add --task {task}")

@@ -19,7 +19,7 @@ def main(arguments: Sequence[str]) -> int:
     """Writes the page.
 
     Raises:
-      UserError: a directory without a run, or a page that cannot be written.
+      UserError: no run, or a page that cannot be written.
     """
     parser = Parser(prog="train report", description=DESCRIPTION, allow_abbrev=False)
     parser.add_argument("logdirs", type=Path, nargs="+", metavar="LOGDIR", help="log directory of a run, or a directory that holds some")

@@ -136,6 +136,8 @@ def _starts(run: RunLog) -> str:
         now |= {str(name): show(version) for name, version in _entries(start.get("versions"))}
         changed = [f"{name} {value}" for name, value in now.items() if before is not None and before.get(name) != value]
         what = ", ".join(changed) if before is not None else f"{now['backend']} on {now['device']}, commit {now['commit'] or 'unknown'}"
+        given = [f"{name} {show(values[-1])}" for name, values in _entries(start.get("changed")) if isinstance(values, list) and values]
+        what = ", ".join([*filter(None, [what]), *given])
         rows.append([cell(show(start.get("time"))), cell(show(start.get("step")), "number"), cell(what or "nothing changed")])
         before = now
     return table(["time", "step", "with"], rows, numbers=(1,))

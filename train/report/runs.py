@@ -3,7 +3,7 @@
 import array
 import dataclasses
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -90,20 +90,29 @@ class Group:
         return f"{count} {what}{'' if count == 1 else 's'}"
 
 
-def find_logdirs(paths: Sequence[Path]) -> list[Path]:
+def find_logdirs(paths: Sequence[Path], say: Callable[[str], None] = print) -> list[Path]:
     """The log directories among these paths and, where a path is none, directly below it; each once.
 
+    say: is told of each path without any run, which is left out.
+
     Raises:
-      UserError: a path that is not there, or without any run.
+      UserError: a path that is not there, or no run anywhere.
     """
     found: dict[Path, Path] = {}
+    without = []
     for path in paths:
-        if not path.is_dir():
-            raise UserError(f"{path} is not a directory; expected a log directory of train, or one that holds some")
-        logdirs = [path] if _is_logdir(path) else sorted(child for child in path.iterdir() if _is_logdir(child))
-        if not logdirs:
-            raise UserError(f"{path} holds no run: neither metrics.jsonl nor run.json is in it, or in a directory below it")
+        if not path.exists():
+            raise UserError(f"{path} is not there; expected a log directory of train, or one that holds some")
+        children = sorted(path.iterdir()) if path.is_dir() else []
+        logdirs = [path] if _is_logdir(path) else [child for child in children if _is_logdir(child)]
+        without += [] if logdirs else [path]
         found |= {logdir.resolve(): logdir for logdir in logdirs}
+    if not found:
+        raise UserError(
+            f"{', '.join(map(str, without))} holds no run: neither metrics.jsonl nor run.json is in it, or in a directory below it"
+        )
+    for path in without:
+        say(f"{path} holds no run and is left out")
     return list(found.values())
 
 

@@ -1,0 +1,49 @@
+"""`train --seeds 0-4`: runs that differ in their seed alone, one after the other, each in a log directory of its own. [LOOP-73]"""
+
+import sys
+import traceback
+from collections.abc import Callable, Sequence
+
+from train.about import read_about
+from train.errors import UserError
+from train.options import Options
+from train.outcome import last_words, read_outcome, summary
+
+
+def run_all(runs: Sequence[Options], run: Callable[[Options], bool], say: Callable[[str], None] = print) -> int:
+    """Trains, or continues, one run after the other, and says what came of all. Returns the exit code: 2 if one failed, 130 after Ctrl-C.
+
+    A run that fails is named, and the next one begins: the others are not lost. But what keeps the first one from beginning at all, such
+    as an unknown task, would keep them all.
+
+    Raises:
+      UserError: the first run could not begin.
+    """
+    ended, failed, interrupted = [], [], False
+    for number, options in enumerate(runs):
+        say(f"seed {options.seed} ({number + 1} of {len(runs)})")
+        try:
+            interrupted = not run(options)
+        except UserError as error:
+            if number == 0 and read_about(options.logdir) is None:
+                raise
+            print(f"{error.details.rstrip()}\ntrain: error: seed {options.seed}: {' '.join(str(error).split())}".strip(), file=sys.stderr)
+            failed.append(options)
+            continue
+        except Exception:  # Not ours to know; the other seeds are not to be lost by it.
+            traceback.print_exc()
+            failed.append(options)
+            continue
+        if interrupted:
+            break
+        ended.append(options)
+    outcomes = {options.seed: read_outcome(options.logdir) for options in ended}
+    for options in ended:
+        say(f"seed {options.seed}: {last_words(outcomes[options.seed], None)}; {options.logdir}")
+    for options in failed:
+        say(f"seed {options.seed} failed; {options.logdir}")
+    if interrupted:
+        say(f"interrupted in seed {options.seed}; the same command continues from there")
+    if ended:
+        say(summary(outcomes))
+    return 130 if interrupted else 2 if failed else 0
