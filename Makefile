@@ -4,10 +4,10 @@ BACKEND ?= jax
 RUN := .venv/bin
 INSTALL := $(RUN)/python -m pip install --quiet --disable-pip-version-check
 UV := .venv-uv/bin/uv
-# What test-lowest and test-newest install, and what pytest runs. PyTorch is gigabytes: RANGES=jax,torch,dm-control,test RANGE_TESTS=tests
+# What test-lowest and test-newest install and test. PyTorch is gigabytes there; with it: RANGES=jax,torch,dm-control,test RANGE_TESTS=tests
 RANGES ?= jax,dm-control,test
-RANGE_TESTS ?= $(addprefix tests/test_,$(addsuffix .py,learners optimizers reference_agent reference_replay spec train_cli \
-	train_envs train_logger train_loop train_replay train_report)) -k 'not torch'
+RANGE_TESTS ?= $(addprefix tests/test_,$(addsuffix .py,learners reference_agent reference_replay reports skeleton spec train_cli train_envs \
+	train_logger train_loop train_replay train_report)) -k 'not torch and not in_the_other'
 
 .PHONY: train test test-slow test-lowest test-newest bench docs lint lock clean
 
@@ -36,6 +36,7 @@ test-newest: .venv-newest/.tested
 	$(UV) pip install --quiet --python $(@D) --resolution $(RESOLUTION) --override requirements/overrides.txt -e '.[$(RANGES)]'
 	$(UV) pip freeze --quiet --python $(@D) --exclude-editable
 	$(@D)/bin/pytest -n 2 --dist loadgroup $(RANGE_TESTS)
+	$(@D)/bin/train --backend $(BACKEND) --steps 2000 --logdir $(@D)/run --resume never
 
 bench: .venv/.installed
 	$(RUN)/python -m benchmarks.train_step
