@@ -83,6 +83,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser = Parser(
         prog="train", description=DESCRIPTION, formatter_class=_Formatter, usage="train --backend {jax,torch} [options]", allow_abbrev=False
     )
+    parser.epilog = "Where the pages docs/*.md are: conformance docs"
     base = presets()["base"]
 
     run = parser.add_argument_group("run")
