@@ -1,38 +1,74 @@
 # Two commands on a fresh machine with only Python >= 3.11 and make:  make train   make test
 PYTHON ?= python3
-VENV := .venv
-RUN := $(VENV)/bin
 BACKEND ?= jax
+RUN := .venv/bin
+INSTALL := $(RUN)/python -m pip install --quiet --disable-pip-version-check
+UV := .venv-uv/bin/uv
+# What test-lowest and test-newest install and test. PyTorch is gigabytes there; with it: RANGES=jax,torch,dm-control,test RANGE_TESTS=tests
+RANGES ?= jax,dm-control,test
+RANGE_TESTS ?= $(addprefix tests/test_,$(addsuffix .py,learners reference_agent reference_replay reports skeleton spec train_cli train_envs \
+	train_logger train_loop train_replay train_report)) -k 'not torch and not in_the_other'
 
-.PHONY: train test bench docs lint clean
+.PHONY: train test test-slow test-lowest test-newest bench docs lint lock clean
 
-train: $(VENV)/.installed
+train: .venv/.installed
 	$(RUN)/train --backend $(BACKEND)
 
-test: $(VENV)/.installed
+test: .venv/.installed
 	$(RUN)/ruff format --check .
 	$(RUN)/ruff check .
 	$(RUN)/mypy
 	$(RUN)/conformance coverage
 	$(RUN)/pytest -n 2 --dist loadgroup
 
-bench: $(VENV)/.installed
+test-slow: .venv/.installed
+	$(RUN)/pytest -m slow
+
+# The two ends of the ranges in pyproject.toml, each in an environment of its own; the lock has no say here.
+test-lowest: .venv-lowest/.tested
+test-newest: .venv-newest/.tested
+.venv-lowest/.tested: RESOLUTION := lowest-direct
+.venv-newest/.tested: RESOLUTION := highest
+.PHONY: .venv-lowest/.tested .venv-newest/.tested
+
+.venv-lowest/.tested .venv-newest/.tested: $(UV)
+	$(UV) venv --quiet --clear --python $(PYTHON) $(@D)
+	$(UV) pip install --quiet --python $(@D) --resolution $(RESOLUTION) --override requirements/overrides.txt -e '.[$(RANGES)]'
+	$(UV) pip freeze --quiet --python $(@D) --exclude-editable
+	$(@D)/bin/pytest -n 2 --dist loadgroup $(RANGE_TESTS)
+	$(@D)/bin/train --backend $(BACKEND) --steps 2000 --logdir $(@D)/run --resume never
+
+bench: .venv/.installed
 	$(RUN)/python -m benchmarks.train_step
 
-docs: $(VENV)/.installed
+docs: .venv/.installed
 	$(RUN)/python -m docs.render
 
-lint: $(VENV)/.installed
+lint: .venv/.installed
 	$(RUN)/ruff format .
 	$(RUN)/ruff check --fix .
 	$(RUN)/mypy
 
-# PyTorch first and by its version in constraints.txt: what else needs it then takes the build that is there.
-$(VENV)/.installed: pyproject.toml constraints.txt
-	$(PYTHON) -m venv $(VENV)
-	$(RUN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt torch
-	$(RUN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+# Everything but PyTorch by its hash; then PyTorch, whose files differ between platforms, by the versions in torch.txt.
+.venv/.installed: pyproject.toml requirements/lock.txt requirements/torch.txt
+	$(PYTHON) -c 'import sys; sys.exit("Python >= 3.11 is needed: make PYTHON=..." if sys.version_info < (3, 11) else 0)'
+	$(PYTHON) -m venv .venv
+	$(INSTALL) --no-deps --require-hashes --only-binary :all: -r requirements/lock.txt
+	$(INSTALL) -c requirements/torch.txt torch
+	$(INSTALL) --no-deps --no-build-isolation -e .
 	touch $@
 
+# Renews both files to the newest versions within the ranges of pyproject.toml and requirements/pins.txt, for every Python and platform.
+COMPILE := $(UV) pip compile --quiet --upgrade --universal --python-version 3.11 --custom-compile-command 'make lock' --annotation-style line
+lock: $(UV)
+	echo torch | $(COMPILE) - --constraints requirements/pins.txt --output-file requirements/torch.txt
+	$(COMPILE) pyproject.toml --extra dev --generate-hashes --override requirements/overrides.txt \
+		--constraints requirements/pins.txt --constraints requirements/torch.txt --output-file requirements/lock.txt \
+		$$(sed -nE 's/^((torch|triton|cuda|nvidia)[a-z0-9-]*)==.*/--no-emit-package \1/p' requirements/torch.txt)
+
+$(UV):
+	$(PYTHON) -m venv .venv-uv
+	.venv-uv/bin/python -m pip install --quiet --disable-pip-version-check 'uv>=0.9'
+
 clean:
-	rm -rf $(VENV)
+	rm -rf .venv .venv-uv .venv-lowest .venv-newest

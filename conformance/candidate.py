@@ -78,6 +78,8 @@ def load_candidate(name: str, dtype: str, device: str | None = None) -> object:
         try:
             return load_adapter(name, dtype, device)
         except ImportError as error:
+            if name == "numpy":
+                raise  # The reference needs no extra: its packages are always installed.
             raise UserError(f"{error}; install it with: pip install 'dreamer-spec[{name}]'") from error
         except (ValueError, RuntimeError) as error:
             raise UserError(str(error).partition("\n")[0]) from error

@@ -174,7 +174,7 @@ def _single_precision(arrays: Mapping[str, Any]) -> Arrays:
 
 
 def _contiguous(arrays: Mapping[str, Any]) -> Arrays:
-    return {name: np.array(array, order="C", copy=None) for name, array in arrays.items()}
+    return {name: np.asarray(array, order="C") for name, array in arrays.items()}
 
 
 def _read_arrays(path: Path) -> Arrays:

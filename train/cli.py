@@ -141,6 +141,7 @@ class _Formatter(argparse.RawDescriptionHelpFormatter):
 def build_parser() -> argparse.ArgumentParser:
     """Every option without a default: what is not given comes from the preset, see train/options.py."""
     parser = Parser(prog="train", description=DESCRIPTION, formatter_class=_Formatter, usage=USAGE, allow_abbrev=False)
+    parser.epilog = "Where the pages docs/*.md are: conformance docs"
     parser.add_argument("--version", action="version", version=f"dreamer-spec {own_version()}")
     add_options(parser)
     return parser

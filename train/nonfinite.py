@@ -123,7 +123,7 @@ def save_incident(directory: Path, learner: Learner, batch: Arrays, seed: int, i
         shutil.rmtree(temporary, ignore_errors=True)
         temporary.mkdir(parents=True)
         for file, arrays in zip(FILES, (state, batch), strict=False):
-            save_file({name: np.array(array, order="C", copy=None) for name, array in arrays.items()}, temporary / file)
+            save_file({name: np.asarray(array, order="C") for name, array in arrays.items()}, temporary / file)
         (temporary / FILES[-1]).write_text(json.dumps(incident, indent=2, allow_nan=False) + "\n", encoding="utf-8")
         seal(temporary, FILES)
         if final.exists():

@@ -3,4 +3,4 @@
 A module has a docstring, whose first line is its help, `add_arguments(parser)` and `main(console, options) -> exit code`.
 """
 
-COMMANDS = ("check", "coverage", "lockstep", "mutants", "new_adapter", "report", "vectors")
+COMMANDS = ("check", "coverage", "docs", "lockstep", "mutants", "new_adapter", "report", "vectors")
