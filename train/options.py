@@ -79,6 +79,8 @@ def make_options(backend: str, given: Mapping[str, Any], hyperparameters: Mappin
         preset = DEFAULT_PRESET
     chosen = presets()[preset] if preset else {}
     settings = {**presets()["base"], **chosen, **given}
+    if "task" not in settings:
+        raise UserError(f"the preset {preset} is for any task: name yours, --task MODULE:CALLABLE or SUITE:NAME")
     overrides = {**chosen.get("hyperparameters", {}), **hyperparameters}
     profile = settings.pop("profile")
     try:

@@ -15,6 +15,7 @@ from train.envs import Record
 from train.errors import writing
 from train.evaluation import Agent, Interrupted, evaluate, report_failures
 from train.finite import finite_action, mean_metrics
+from train.forecast import TimeForecast
 from train.logger import duration
 from train.pictures import draw_predictions, prune_pictures
 from train.prediction import SequenceRecorder, predict, prediction_errors
@@ -27,6 +28,7 @@ class Schedule:
     def __init__(self, run: Run) -> None:
         self._clock = self._logged_at = self._saved_at = time.monotonic()
         self._logged = dataclasses.replace(run.counters)
+        self._forecast = TimeForecast()
 
     def attend(self, run: Run) -> None:
         """To be called after every step of the environments."""
@@ -37,6 +39,7 @@ class Schedule:
             with run.clock.part("log"):
                 self._log(run, now)
         self.evaluate(run)
+        self._forecast.attend(run)
 
     def evaluate(self, run: Run) -> None:
         """Plays an evaluation if one is due. To be called before the first step too: a resumed run may have been interrupted in one."""

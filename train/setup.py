@@ -16,6 +16,7 @@ from train.checkpoint import Checkpoint
 from train.envs import Environments, Record, is_slow, make_env
 from train.errors import UserError
 from train.evaluation import play_randomly
+from train.forecast import say_memory
 from train.logger import Display, Logger
 from train.options import Options
 from train.replay import Prefetcher, Replay, erase
@@ -36,6 +37,7 @@ def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -
     if saved:
         checkpoint.require_same_spaces(saved, envs.spaces.to_json())
     parameters = _count_parameters(options, envs.spaces)
+    say_memory(options, envs.spaces, parameters, display.say)
     agent = make_learner(learner_type, options, envs.spaces)  # Before preflight: it says what is wrong with the device.
     report = _preflight(options, envs.spaces, display) if options.preflight else None
     replay, saved, record = _open_replay(options, saved, envs, display)
@@ -159,8 +161,10 @@ def _count_parameters(options: Options, spaces: Spaces) -> int:
 def _preflight(options: Options, spaces: Spaces, display: Display) -> "Report":
     from conformance.preflight import preflight
 
-    display.phase("preflight")
-    report = preflight(options.backend, spaces, options.config, options.device)
+    display.phase("preflight compares the backend with the reference on this configuration (--no-preflight skips it)")
+    report = preflight(
+        options.backend, spaces, options.config, options.device, progress=lambda what: display.phase("preflight", detail=f"{what} agrees")
+    )
     if not report.passed:
         raise UserError(
             f"the backend {options.backend} failed preflight, it deviates from the reference by {report.worst:.3g}: {report.summary}. "

@@ -18,11 +18,13 @@ from train.replay import Prefetcher
 
 @dataclasses.dataclass
 class Counters:
-    """How far a run is. records: environment steps without action repeat; starts: how often all environments began anew."""
+    """How far a run is. records: environment steps without action repeat; starts: how often all environments began anew; due: train steps
+    that wait for the end of an episode."""
 
     records: int = 0
     policy_steps: int = 0
     train_steps: int = 0
+    due: int = 0
     starts: int = 0
     episodes: int = 0
     evaluations: int = 0
