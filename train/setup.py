@@ -14,6 +14,7 @@ from train.about import write_about
 from train.backend import Learner, learner_class
 from train.checkpoint import Checkpoint
 from train.envs import Environments, Record, is_slow, make_env
+from train.envs.frames import repeated_twice
 from train.errors import UserError
 from train.evaluation import play_randomly
 from train.forecast import say_memory
@@ -34,6 +35,8 @@ def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -
     saved = _find_checkpoint(options, display)
     learner_type = learner or import_learner(options.backend)
     envs, test_envs = _make_environments(options, stack)
+    if warning := repeated_twice(options.task, envs.frame_skip, options.action_repeat):
+        display.say(warning)
     if saved:
         checkpoint.require_same_spaces(saved, envs.spaces.to_json())
     parameters = _count_parameters(options, envs.spaces)

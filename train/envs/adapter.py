@@ -9,6 +9,7 @@ from gymnasium import spaces as gym
 
 from reference_numpy.training_loop import derive_seed
 from spec import Discrete, Image, Spaces, Vector
+from train.envs.frames import frame_skip
 from train.envs.spaces import translate
 from train.errors import UserError
 
@@ -45,6 +46,7 @@ class ContractEnv(gymnasium.Env[Observation, np.ndarray]):
         except UserError as error:
             raise UserError(f"task {task}: {error}") from error
         self.spaces: Spaces = self._translation.spaces
+        self.frame_skip = frame_skip(env)
         self.metadata = {}
         self.observation_space, self.action_space = array_spaces(self.spaces)
 
