@@ -147,6 +147,12 @@ def build_parser() -> argparse.ArgumentParser:
         "For environments that must not or cannot repeat them",
     )
 
+    envs.add_argument(
+        "--info-metrics",
+        metavar="NAME,...",
+        help="numbers in the info of an episode's last step to log: is_success, or a/b for info['a']['b'], or a/* for all in it",
+    )
+
     replay = parser.add_argument_group("replay")
     replay.add_argument("--replay-memory", type=_positive, metavar="GIB", help="memory that maps the files of the buffer (default 2)")
     replay.add_argument("--replay-deter", choices=DETER_DTYPES, help="precision of the latents in the buffer (default bfloat16)")

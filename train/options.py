@@ -46,6 +46,7 @@ class Options:
     env_timeout: float = 600.0
     env_failures: int = 10
     restore_envs: bool = True
+    info_metrics: str | None = None
     keep_checkpoints: int = 2
     nonfinite: str = "stop"
     wandb: str | None = None

@@ -15,6 +15,7 @@ from train.backend import Learner, learner_class
 from train.checkpoint import Checkpoint
 from train.envs import Environments, Record, is_slow, make_env
 from train.envs.frames import repeated_twice
+from train.envs.info import names_of
 from train.errors import UserError
 from train.evaluation import play_randomly
 from train.forecast import say_memory
@@ -142,7 +143,13 @@ def import_learner(backend: str) -> type[Learner]:
 
 def _make_environments(options: Options, stack: ExitStack) -> tuple[Environments, Environments | None]:
     """The environments of training, and those of evaluation if there is any."""
-    make = functools.partial(make_env, options.task, image_size=options.image_size, action_repeat=options.action_repeat)
+    make = functools.partial(
+        make_env,
+        options.task,
+        image_size=options.image_size,
+        action_repeat=options.action_repeat,
+        info_metrics=names_of(options.info_metrics),
+    )
     count, processes = options.config.envs, options.processes == "yes"
     if options.processes == "auto" and count > 1:
         processes = is_slow(make, options.seed)

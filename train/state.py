@@ -39,11 +39,11 @@ class Scores:
         self.total = np.zeros(count)
         self.length = np.zeros(count, np.int64)
 
-    def update(self, record: Record) -> list[tuple[float, int]]:
-        """(return, length) of the episodes that end with these records."""
+    def update(self, record: Record) -> list[tuple[int, float, int]]:
+        """(worker, return, length) of the episodes that end with these records."""
         self.total = np.where(record["is_first"], 0.0, self.total) + record["reward"]
         self.length = np.where(record["is_first"], 0, self.length) + 1
-        return [(float(self.total[worker]), int(self.length[worker])) for worker in np.flatnonzero(record["is_last"])]
+        return [(int(worker), float(self.total[worker]), int(self.length[worker])) for worker in np.flatnonzero(record["is_last"])]
 
 
 class Means:
