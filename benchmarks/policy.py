@@ -1,34 +1,37 @@
 """Actions per second of a NumPy-only policy: `OPENBLAS_NUM_THREADS=1 python -m benchmarks.policy`.
 
-Vectors of 24 numbers in, six real numbers out, random parameters, in one environment and in 16. Seconds are those of the processor that
-the process took, so that other load on the machine counts little.
+Vectors of 24 numbers or one RGB image in, six real numbers out, random parameters, in one environment and in 16. Seconds are those of the
+processor that the process took, so that other load on the machine counts little.
 """
 
 import time
 
 import numpy as np
 
-from spec import Spaces, Vector, load_config
+from spec import Image, Spaces, Vector, load_config
 from train.machine import describe
 from train.policy import Policy
 from train.saved_agent import SavedAgent, acting_table
 
-SPACES = Spaces({"observation": Vector(24)}, {"action": Vector(6)})
-REPEATS, SECONDS = 5, 1.0
+OBSERVATIONS = {"vector": Vector(24), "image of 32 x 32": Image(32, 32, 3), "image of 64 x 64": Image(64, 64, 3)}
+REPEATS, SECONDS = 5, 0.5
 
 
-def rate(size: str, rows: int) -> float:
+def rate(size: str, observed: str, rows: int) -> float:
     """The best of some repeats."""
+    space = OBSERVATIONS[observed]
+    spaces = Spaces({"observation": space}, {"action": Vector(6)})
     rng, config = np.random.default_rng(0), load_config("paper", size)
-    parameters = {name: rng.normal(0, 0.05, entry.shape).astype(np.float32) for name, entry in acting_table(config, SPACES).items()}
-    policy = Policy(SavedAgent(config, SPACES, parameters, {}))
+    parameters = {name: rng.normal(0, 0.05, entry.shape).astype(np.float32) for name, entry in acting_table(config, spaces).items()}
+    policy = Policy(SavedAgent(config, spaces, parameters, {}))
     policy.reset(rows)
-    observation, is_first = {"observation": rng.normal(size=(rows, 24))}, np.zeros(rows, bool)
+    shape, is_first = (rows, *space.array_shape), np.zeros(rows, bool)
+    value = rng.integers(0, 256, shape).astype(np.uint8) if isinstance(space, Image) else rng.normal(size=shape)
     rates = []
     for _ in range(REPEATS):
         steps, start = 0, time.process_time()
         while time.process_time() - start < SECONDS:
-            policy(observation, is_first)
+            policy({"observation": value}, is_first)
             steps += 1
         rates.append(rows * steps / (time.process_time() - start))
     return max(rates)
@@ -37,7 +40,8 @@ def rate(size: str, rows: int) -> float:
 def main() -> None:
     print(describe())
     for size in ("tiny", "1m", "12m"):
-        print(f"| {size} | {rate(size, 1):,.0f} | {rate(size, 16):,.0f} |")
+        for observed in OBSERVATIONS:
+            print(f"| {size} | {observed} | {rate(size, observed, 1):,.0f} | {rate(size, observed, 16):,.0f} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -62,13 +62,24 @@ class Report:
     comparisons: list[Comparison]
 
 
-def preflight(backend: str, spaces: Spaces, config: Config, device: str | None = None, seed: int = 0) -> Report:
-    """Compares a backend (jax, torch or numpy) with the reference."""
-    return preflight_adapter(load_adapter(backend, config.compute_dtype, device), spaces, config, seed)
+def _silent(what: str) -> None:
+    pass
 
 
-def preflight_adapter(adapter: object, spaces: Spaces, config: Config, seed: int = 0) -> Report:
-    """Compares any adapter with the reference."""
+def preflight(
+    backend: str,
+    spaces: Spaces,
+    config: Config,
+    device: str | None = None,
+    seed: int = 0,
+    progress: Callable[[str], None] = _silent,
+) -> Report:
+    """Compares a backend (jax, torch or numpy) with the reference. progress: is told what has been found to agree."""
+    return preflight_adapter(load_adapter(backend, config.compute_dtype, device), spaces, config, seed, progress)
+
+
+def preflight_adapter(adapter: object, spaces: Spaces, config: Config, seed: int = 0, progress: Callable[[str], None] = _silent) -> Report:
+    """Compares any adapter with the reference. progress: see `preflight`."""
     small = dataclasses.replace(config, batch_size=ROWS, batch_length=STEPS, imagination_horizon=STEPS)
     run = Run(adapter, config.compute_dtype, "", seed)
     worst, comparisons = 0.0, []
@@ -80,6 +91,7 @@ def preflight_adapter(adapter: object, spaces: Spaces, config: Config, seed: int
             for what, function in part(run, spaces, small):
                 comparisons.append(Comparison(what, re.findall(r"\[([A-Z]+-\d+)\]", function.__doc__ or ""), run.worst.share))
                 worst, run.worst = max(worst, run.worst.deviation), Worst()
+                progress(what)
         except Deviation as deviation:
             return Report(False, run.worst.deviation, f"{name}: {deviation}", comparisons)
     names = ", ".join(name for name, _ in parts)

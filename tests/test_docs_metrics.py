@@ -10,7 +10,7 @@ from train.logger import iterate_metrics
 from train.options import make_options
 from train.report.catalogue import find, markdown, sections
 
-SPECIAL = {"memory/device"}  # with an accelerator only
+SPECIAL = {"memory/device", "episode/info/<key>", "evaluation/info/<key>"}  # with an accelerator, with --info-metrics
 
 TINY = {
     **{"batch_size": 2, "batch_length": 3, "units": 8, "deter": 8, "blocks": 1, "stoch": 2, "classes": 2, "bins": 5},

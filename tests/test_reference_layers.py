@@ -175,7 +175,7 @@ def test_a_convolution_takes_any_leading_axes(leading: tuple[int, ...]) -> None:
     rng = np.random.default_rng(0)
     x, kernel, bias = rng.normal(size=(*leading, 6, 4, 3)), rng.normal(size=(5, 5, 3, 2)), rng.normal(size=2)
     for stride in (1, 2):
-        y = layers.convolution(x, kernel, bias, stride)
+        y = convolution(x, kernel, bias, stride)
         assert y.shape == (*leading, 6 // stride, 4 // stride, 2)
         for place in np.ndindex(leading):
-            np.testing.assert_allclose(y[place], layers.convolution(x[place], kernel, bias, stride), rtol=1e-12)
+            np.testing.assert_allclose(y[place], convolution(x[place], kernel, bias, stride), rtol=1e-12)

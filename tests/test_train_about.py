@@ -26,7 +26,8 @@ def write(options: Options, resumed_at: int | None = None) -> dict[str, Any]:
 
 @pytest.mark.parametrize("preset", [name for name in presets() if name != "base"])
 def test_the_command_of_every_preset_gives_its_options(preset: str, tmp_path: Path) -> None:
-    options = make_options("jax", {"logdir": tmp_path / "a b"}, {}, preset)
+    task = {} if "task" in presets()[preset] else {"task": "my_module:make_env"}
+    options = make_options("jax", {"logdir": tmp_path / "a b", **task}, {}, preset)
     words = command_line(options)
     assert "--preset" not in words
     assert parse(words[1:]) == options

@@ -38,7 +38,7 @@ def fakes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Report:
     """A learner that needs no backend, and a preflight that says what the test wants."""
     report = Report(True, 1e-7, "3 checks")
     module = types.ModuleType("conformance.preflight")
-    module.preflight = lambda *arguments: report  # type: ignore[attr-defined]
+    module.preflight = lambda *arguments, **options: report  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "conformance.preflight", module)
     monkeypatch.setattr(train.setup, "learner_class", lambda backend: FakeLearner)
     monkeypatch.chdir(tmp_path)
@@ -175,7 +175,13 @@ def test_precedence_of_base_preset_and_command_line() -> None:
 
 @pytest.mark.parametrize("name", [name for name in presets() if name != "base"])
 def test_presets_are_valid(name: str) -> None:
-    assert parse(["--backend", "jax", "--preset", name]).task
+    task = [] if "task" in presets()[name] else ["--task", "my_module:make_env"]
+    assert parse(["--backend", "jax", "--preset", name, *task]).task
+
+
+def test_a_preset_for_any_task_asks_for_one() -> None:
+    with pytest.raises(UserError, match=r"preset laptop.*--task"):
+        parse(["--backend", "jax", "--preset", "laptop"])
 
 
 def test_every_hyperparameter_is_an_option_in_both_spellings() -> None:

@@ -1,5 +1,6 @@
 """Threads: as many as the cores that a process may use, one for small models, and one in each environment's process."""
 
+import functools
 import multiprocessing
 import os
 import subprocess
@@ -15,7 +16,7 @@ from train_fakes import FakeLearner
 from train_runs import Make
 
 from spec import Image, Spaces, Vector, load_config
-from train import loop, threads
+from train import cgroups, loop, threads
 from train.envs import ContractEnv
 
 VECTORS = Spaces({"observation": Vector(3)}, {"action": Vector(1)})
@@ -102,8 +103,25 @@ def test_the_cores_of_a_container_are_those_of_its_quota(
     monkeypatch.setattr(os, "process_cpu_count", lambda: 8, raising=False)
     place(tmp_path / "cgroup", files)
     place(tmp_path, {"membership": membership})
-    assert threads.usable_cores(tmp_path / "cgroup", tmp_path / "membership") == expected
-    assert threads.usable_cores(tmp_path / "nothing", tmp_path / "nowhere") == 8
+    monkeypatch.setattr(cgroups, "quotas", functools.partial(cgroups.quotas, tmp_path / "cgroup", tmp_path / "membership"))
+    assert threads.usable_cores() == expected
+
+
+@pytest.mark.parametrize(
+    ("membership", "files", "expected"),
+    [
+        ("0::/box\n", {"box/memory.max": "1073741824\n", "memory.max": "max\n"}, [2**30]),
+        ("4:memory:/box\n0::/\n", {"memory/box/memory.limit_in_bytes": "2147483648\n"}, [2**31]),
+        ("4:memory:/../box\n", {}, []),
+    ],
+)
+def test_the_memory_of_a_container_is_that_of_its_limit(
+    membership: str, files: dict[str, str], expected: list[int], tmp_path: Path
+) -> None:
+    place(tmp_path / "cgroup", files)
+    place(tmp_path, {"membership": membership})
+    assert cgroups.memory_limits(tmp_path / "cgroup", tmp_path / "membership") == expected
+    assert cgroups.memory_limits(tmp_path / "nothing", tmp_path / "nowhere") == []
 
 
 USED = {

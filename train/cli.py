@@ -28,7 +28,7 @@ DESCRIPTION = """Train a DreamerV3 agent.
   train --backend jax                                            the default task, in minutes
   train --backend torch --task gym:Acrobot-v1 --size tiny        any Gymnasium id
   train --backend jax --preset dmc_proprio --task dmc:cheetah-run    the paper's protocol
-  train --backend jax --task my_module:make_env                  your own: a function that returns a gymnasium.Env
+  train --backend jax --task my_module:make_env --preset laptop  your own: a function that returns a gymnasium.Env
 
 The same command again continues the run in its log directory. Commands for what it leaves there:
 
@@ -212,6 +212,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         action=argparse.BooleanOptionalAction,
         help="--no-restore-envs: a resumed run begins new episodes; otherwise it repeats the actions of those under way. "
         "For environments that must not or cannot repeat them",
+    )
+
+    envs.add_argument(
+        "--info-metrics",
+        metavar="NAME,...",
+        help="numbers in the info of an episode's last step to log: is_success, or a/b for info['a']['b'], or a/* for all in it",
     )
 
     replay = parser.add_argument_group("replay")

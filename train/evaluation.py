@@ -1,6 +1,6 @@
 """Episodes that are played but not learned from: evaluation of the agent, and what a random policy gets."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,10 +16,11 @@ Act = Callable[[Record], np.ndarray]
 
 
 class Episode(NamedTuple):
-    """score: the sum of the rewards, undiscounted. length: in records, the reset's included."""
+    """score: the sum of the rewards, undiscounted. length: in records, the reset's included. info: what --info-metrics has chosen."""
 
     score: float
     length: int
+    info: Mapping[str, float]
 
 
 class Interrupted(Exception):
@@ -50,7 +51,7 @@ def play_episodes(envs: Environments, act: Act, episodes: int, seeds: list[int],
         length = np.where(record["is_first"], 0, length) + 1
         for worker in np.flatnonzero(record["is_last"]):
             if len(played[worker]) < share[worker]:
-                played[worker].append(Episode(float(total[worker]), int(length[worker])))
+                played[worker].append(Episode(float(total[worker]), int(length[worker]), envs.info[worker]))
         unfinished = [len(ended) < wanted for ended, wanted in zip(played, share, strict=True)]
         if not any(unfinished):
             return [episode for ended in played for episode in ended]
@@ -91,14 +92,14 @@ class Agent:
         return np.asarray(action)
 
 
-def evaluate(act: Act, envs: Environments, episodes: int, seed: int, earlier: int, interrupted: Sequence[int] = ()) -> list[float]:
-    """Returns of the agent as it is now, sampling its actions: [LOOP-18], [LOOP-19]. earlier: evaluations of this run before.
+def evaluate(act: Act, envs: Environments, episodes: int, seed: int, earlier: int, interrupted: Sequence[int] = ()) -> list[Episode]:
+    """Episodes of the agent as it is now, sampling its actions: [LOOP-18], [LOOP-19]. earlier: evaluations of this run before.
 
     Raises:
       Interrupted: `interrupted` is no longer empty.
     """
     seeds = [derive_seed(seed, "evaluation_environment", worker + envs.count * earlier) for worker in range(envs.count)]
-    return play(envs, act, episodes, seeds, interrupted)
+    return play_episodes(envs, act, episodes, seeds, interrupted)
 
 
 def play_randomly(envs: Environments, episodes: int, seed: int) -> list[float]:

@@ -243,13 +243,14 @@ class Display:
         """
         self._show("training", step, self._total, " · ".join([f"step {step:,}", *facts]))
 
-    def phase(self, name: str, done: int = 0, total: int | None = None, unit: str = "") -> None:
+    def phase(self, name: str, done: int = 0, total: int | None = None, unit: str = "", detail: str = "") -> None:
         """Something beside training goes on; to be called as often as one likes, and before anything that takes long.
 
         total: how much there is to do, in the unit; None if nobody knows, as with a compilation. Where there is no terminal, such a phase
-        is said when it begins, because nobody may call again before it is over.
+        is said when it begins, because nobody may call again before it is over. detail: what has just been done.
         """
-        self._show(name, done, total, name if total is None else f"{name} {done:,}/{total:,} {unit}".rstrip())
+        text = name if total is None else f"{name} {done:,}/{total:,} {unit}".rstrip()
+        self._show(name, done, total, f"{text}: {detail}" if detail else text)
 
     def _show(self, phase: str, done: int, total: int | None, text: str) -> None:
         begins, self._phase = phase != self._phase, phase

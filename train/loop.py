@@ -68,8 +68,8 @@ def act(run: Run) -> None:
     with run.clock.part("environments"):
         run.envs.start(action)
     remember_and_learn(run, record, action, {name: np.asarray(value) for name, value in latents.items()})
-    for score, length in run.scores.update(record):
-        log_episode(run, score, length)
+    for worker, score, length in run.scores.update(record):
+        log_episode(run, score, length, run.envs.info[worker])
 
 
 def remember_and_learn(run: Run, record: Record, action: np.ndarray, latents: Mapping[str, np.ndarray]) -> None:

@@ -49,6 +49,7 @@ class Options:
     env_timeout: float = 600.0
     env_failures: int = 10
     restore_envs: bool = True
+    info_metrics: str | None = None
     keep_checkpoints: int = 2
     nonfinite: str = "stop"
     wandb: str | None = None
@@ -95,6 +96,8 @@ def make_options(backend: str, given: Mapping[str, Any], changed: Mapping[str, A
         preset = DEFAULT_PRESET
     chosen = presets()[preset] if preset else {}
     settings = {**presets()["base"], **chosen, **given}
+    if "task" not in settings:
+        raise UserError(f"the preset {preset} is for any task: name yours, --task MODULE:CALLABLE or SUITE:NAME")
     overrides = {**chosen.get("hyperparameters", {}), **changed}
     profile = settings.pop("profile")
     try:

@@ -4,7 +4,7 @@ import dataclasses
 import math
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -12,9 +12,11 @@ from reference_numpy.training_loop import derive_seed
 from train import resume
 from train.curve import draw_curve
 from train.envs import Record
+from train.envs.info import is_pattern, names_of
 from train.errors import writing
-from train.evaluation import Agent, Interrupted, evaluate, report_failures
+from train.evaluation import Agent, Episode, Interrupted, evaluate, report_failures
 from train.finite import finite_action, mean_metrics
+from train.forecast import TimeForecast
 from train.logger import duration
 from train.outcome import first_train_step, last_words, next_commands, read_outcome, why_untrained
 from train.pictures import draw_predictions, prune_pictures
@@ -28,6 +30,7 @@ class Schedule:
     def __init__(self, run: Run) -> None:
         self._clock = self._logged_at = self._saved_at = time.monotonic()
         self._logged = dataclasses.replace(run.counters)
+        self._forecast = TimeForecast()
 
     def attend(self, run: Run) -> None:
         """To be called after every step of the environments."""
@@ -38,6 +41,7 @@ class Schedule:
             with run.clock.part("log"):
                 self._log(run, now)
         self.evaluate(run)
+        self._forecast.attend(run)
 
     def evaluate(self, run: Run) -> None:
         """Plays an evaluation if one is due. To be called before the first step too: a resumed run may have been interrupted in one."""
@@ -109,11 +113,15 @@ def _evaluation_is_due(run: Run) -> bool:
     return every > 0 and run.step // every > last // every and run.step < run.options.steps
 
 
-def log_episode(run: Run, score: float, length: int) -> None:
+def log_episode(run: Run, score: float, length: int, info: Mapping[str, float]) -> None:
     """A training episode has ended."""
     run.counters.episodes += 1
     run.returns.append(score)
-    run.logger.write(run.step, run.counters.seconds, {"episode/return": score, "episode/length": length})
+    numbers = {f"episode/info/{name}": value for name, value in info.items()}
+    run.logger.write(run.step, run.counters.seconds, {"episode/return": score, "episode/length": length, **numbers})
+    missing = [name for name in names_of(run.options.info_metrics) if not is_pattern(name) and name not in info]
+    if missing and run.counters.episodes == 1:
+        run.display.say(f"WARNING: the info of the first episode's last step does not have {', '.join(missing)} (--info-metrics)")
 
 
 def run_evaluation(run: Run) -> None:
@@ -133,11 +141,12 @@ def run_evaluation(run: Run) -> None:
         return action
 
     try:
-        returns = evaluate(act, run.test_envs, options.eval_episodes, options.seed, counters.evaluations, run.interrupted)
+        episodes = evaluate(act, run.test_envs, options.eval_episodes, options.seed, counters.evaluations, run.interrupted)
     except Interrupted:
         return
     finally:
         report_failures(run.test_envs, run.display.say)
+    returns = [episode.score for episode in episodes]
     errors = show_predictions(run, recorder)
     counters.evaluations += 1
     counters.evaluation_steps = agent.step
@@ -145,7 +154,14 @@ def run_evaluation(run: Run) -> None:
     metrics = {"return": run.evaluation["return"], "return_min": min(returns), "return_max": max(returns)}
     if len(returns) > 1:
         metrics["return_standard_error"] = float(np.std(returns, ddof=1)) / math.sqrt(len(returns))
+    metrics |= {f"info/{name}": value for name, value in mean_info(episodes).items()}
     run.logger.write(run.step, counters.seconds, {f"evaluation/{name}": value for name, value in metrics.items()} | errors)
+
+
+def mean_info(episodes: Sequence[Episode]) -> dict[str, float]:
+    """Of each number of --info-metrics, over the episodes that have it."""
+    names = dict.fromkeys(name for episode in episodes for name in episode.info)
+    return {name: float(np.mean([episode.info[name] for episode in episodes if name in episode.info])) for name in names}
 
 
 def show_predictions(run: Run, recorder: SequenceRecorder) -> dict[str, float]:

@@ -16,8 +16,11 @@ from train.about import write_about
 from train.backend import Learner, learner_class
 from train.checkpoint import Checkpoint
 from train.envs import Environments, Record, is_slow, make_env
+from train.envs.frames import repeated_twice
+from train.envs.info import names_of
 from train.errors import UserError
 from train.evaluation import play_randomly
+from train.forecast import say_memory
 from train.logger import Display, Logger
 from train.options import Options
 from train.outcome import mean_of
@@ -41,10 +44,13 @@ def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -
     saved = _find_checkpoint(options, display)
     learner_type = learner or import_learner(options.backend)
     envs, test_envs = _make_environments(options, stack)
+    if warning := repeated_twice(options.task, envs.frame_skip, options.action_repeat):
+        display.say(warning)
     if saved:
         checkpoint.require_same_spaces(saved, envs.spaces.to_json())
         require_same_origin(options)
     parameters = _count_parameters(options, envs.spaces)
+    say_memory(options, envs.spaces, parameters, display.say)
     agent = make_learner(learner_type, options, envs.spaces)  # Before preflight: it says what is wrong with the device.
     origin = begin_from(options, agent, envs.spaces) if options.from_ and not saved else None
     report = _preflight(options, envs.spaces, display) if options.preflight and _progress(options, saved)[1] < options.steps else None
@@ -177,7 +183,13 @@ def import_learner(backend: str) -> type[Learner]:
 
 def _make_environments(options: Options, stack: ExitStack) -> tuple[Environments, Environments | None]:
     """The environments of training, and those of evaluation if there is any."""
-    make = functools.partial(make_env, options.task, image_size=options.image_size, action_repeat=options.action_repeat)
+    make = functools.partial(
+        make_env,
+        options.task,
+        image_size=options.image_size,
+        action_repeat=options.action_repeat,
+        info_metrics=names_of(options.info_metrics),
+    )
     count, processes = options.config.envs, options.processes == "yes"
     if options.processes == "auto" and count > 1:
         processes = is_slow(make, options.seed)
@@ -199,8 +211,10 @@ def _count_parameters(options: Options, spaces: Spaces) -> int:
 def _preflight(options: Options, spaces: Spaces, display: Display) -> "Report":
     from conformance.preflight import preflight
 
-    display.phase("preflight")
-    report = preflight(options.backend, spaces, options.config, options.device)
+    display.phase("preflight compares the backend with the reference on this configuration (--no-preflight skips it)")
+    report = preflight(
+        options.backend, spaces, options.config, options.device, progress=lambda what: display.phase("preflight", detail=f"{what} agrees")
+    )
     if not report.passed:
         raise UserError(
             f"the backend {options.backend} failed preflight, it deviates from the reference by {report.worst:.3g}: {report.summary}. "

@@ -18,11 +18,13 @@ from train.replay import Prefetcher
 
 @dataclasses.dataclass
 class Counters:
-    """How far a run is. records: environment steps without action repeat; starts: how often all environments began anew."""
+    """How far a run is. records: environment steps without action repeat; starts: how often all environments began anew; due: train steps
+    that wait for the end of an episode."""
 
     records: int = 0
     policy_steps: int = 0
     train_steps: int = 0
+    due: int = 0
     starts: int = 0
     episodes: int = 0
     evaluations: int = 0
@@ -37,11 +39,11 @@ class Scores:
         self.total = np.zeros(count)
         self.length = np.zeros(count, np.int64)
 
-    def update(self, record: Record) -> list[tuple[float, int]]:
-        """(return, length) of the episodes that end with these records."""
+    def update(self, record: Record) -> list[tuple[int, float, int]]:
+        """(worker, return, length) of the episodes that end with these records."""
         self.total = np.where(record["is_first"], 0.0, self.total) + record["reward"]
         self.length = np.where(record["is_first"], 0, self.length) + 1
-        return [(float(self.total[worker]), int(self.length[worker])) for worker in np.flatnonzero(record["is_last"])]
+        return [(int(worker), float(self.total[worker]), int(self.length[worker])) for worker in np.flatnonzero(record["is_last"])]
 
 
 class Means:

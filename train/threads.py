@@ -2,8 +2,9 @@
 run could not be bit for bit what it would have been."""
 
 import os
-from pathlib import Path
 from typing import TYPE_CHECKING
+
+from train import cgroups
 
 if TYPE_CHECKING:  # The command imports this module before NumPy.
     from spec import Config, Spaces
@@ -40,7 +41,7 @@ def limit_numpy() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", str(max(1, usable_cores() - 1)))
 
 
-def usable_cores(cgroups: Path = Path("/sys/fs/cgroup"), membership: Path = Path("/proc/self/cgroup")) -> int:
+def usable_cores() -> int:
     """Cores that this process may use: its affinity, and the quota of its container; at least 1."""
     if hasattr(os, "process_cpu_count"):  # Python 3.13
         cores = os.process_cpu_count() or 1
@@ -48,32 +49,4 @@ def usable_cores(cgroups: Path = Path("/sys/fs/cgroup"), membership: Path = Path
         cores = len(os.sched_getaffinity(0))
     else:
         cores = os.cpu_count() or 1
-    return max(1, int(min([cores, *_quotas(cgroups, membership)])))
-
-
-def _quotas(cgroups: Path, membership: Path) -> list[float]:
-    """The quotas of CPU time of this process's control groups, in cores; of versions 1 and 2, up to the root."""
-    quotas = []
-    for line in (_text(membership) or "").splitlines():
-        _, controllers, group = line.split(":", 2)
-        if controllers and "cpu" not in controllers.split(","):
-            continue
-        root = cgroups / "cpu" if controllers else cgroups
-        folder = root / group.strip("/")
-        for place in (folder, *folder.parents):
-            if controllers:
-                words = [_text(place / f"cpu.cfs_{name}_us") or "" for name in ("quota", "period")]
-            else:
-                words = (_text(place / "cpu.max") or "").split()
-            if len(words) == 2 and all(word.strip().isdecimal() for word in words) and int(words[1]):  # Without a quota: "max" or -1.
-                quotas.append(int(words[0]) / int(words[1]))
-            if place == root:
-                break
-    return quotas
-
-
-def _text(path: Path) -> str | None:
-    try:
-        return path.read_text(encoding="ascii")
-    except (OSError, UnicodeDecodeError):
-        return None
+    return max(1, int(min([cores, *cgroups.quotas()])))

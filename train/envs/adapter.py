@@ -1,6 +1,7 @@
 """One environment as the contract wants it: a Gymnasium environment with arrays in, arrays out, and everything that comes in checked."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
@@ -9,6 +10,8 @@ from gymnasium import spaces as gym
 
 from reference_numpy.training_loop import derive_seed
 from spec import Discrete, Image, Spaces, Vector
+from train.envs.frames import frame_skip
+from train.envs.info import EpisodeInfo, chosen
 from train.envs.spaces import translate
 from train.errors import UserError
 
@@ -25,19 +28,29 @@ class ContractEnv(gymnasium.Env[Observation, np.ndarray]):
     """Wraps an environment: observations become arrays of `spec.Spaces`, flat actions become the environment's, actions are repeated.
 
     env: the environment. task, index: its name and number, for messages. image_size: side of every image, in pixels. action_repeat: how
-    often each action is applied; the rewards are summed, and the repetition stops where the episode ends.
+    often each action is applied; the rewards are summed, and the repetition stops where the episode ends. info_metrics: names in the
+    info of an episode's last step that `step` returns under "metrics", see `info.chosen`.
 
     Raises:
       UserError: an unsupported space.
       Garbage: from `reset` and `step`, whatever the environment returns that its spaces do not allow, NaN included.
     """
 
-    def __init__(self, env: gymnasium.Env[Any, Any], task: str, index: int = 0, image_size: int = 64, action_repeat: int = 1) -> None:
+    def __init__(
+        self,
+        env: gymnasium.Env[Any, Any],
+        task: str,
+        index: int = 0,
+        image_size: int = 64,
+        action_repeat: int = 1,
+        info_metrics: Sequence[str] = (),
+    ) -> None:
         self.task = task
         self._env = env
         self._index = index
         self._steps = 0
         self._action_repeat = action_repeat
+        self._info_metrics = info_metrics
         self._seed: int | None = None
         self._episode = 0
         try:
@@ -45,6 +58,7 @@ class ContractEnv(gymnasium.Env[Observation, np.ndarray]):
         except UserError as error:
             raise UserError(f"task {task}: {error}") from error
         self.spaces: Spaces = self._translation.spaces
+        self.frame_skip = frame_skip(env)
         self.metadata = {}
         self.observation_space, self.action_space = array_spaces(self.spaces)
 
@@ -72,13 +86,14 @@ class ContractEnv(gymnasium.Env[Observation, np.ndarray]):
                 raise self._garbage(
                     f"step returned {_describe(value)}; Gymnasium's step returns (observation, reward, terminated, truncated, info)"
                 )
-            observation, reward, terminated, truncated, _info = value
+            observation, reward, terminated, truncated, info = value
             total += self._reward(reward)
             if terminated or truncated:
                 break
         if abs(total) > FLOAT32_MAX:
             raise self._garbage(f"the rewards of {self._action_repeat} repeated actions add up to {total}, more than float32 can hold")
-        return self._observation(observation), total, bool(terminated), bool(truncated), {}
+        extra = {"metrics": self._metrics(info)} if self._info_metrics and (terminated or truncated) else {}
+        return self._observation(observation), total, bool(terminated), bool(truncated), extra
 
     def close(self) -> None:
         self._env.close()
@@ -86,6 +101,12 @@ class ContractEnv(gymnasium.Env[Observation, np.ndarray]):
     def _observation(self, value: Any) -> Observation:
         try:
             return self._translation.observation(value)
+        except UserError as error:
+            raise self._garbage(str(error)) from error
+
+    def _metrics(self, info: Any) -> EpisodeInfo:
+        try:
+            return chosen(info, self._info_metrics)
         except UserError as error:
             raise self._garbage(str(error)) from error
 

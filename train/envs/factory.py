@@ -8,6 +8,7 @@ MODULE:CALLABLE     your own: a function or class that, called without arguments
 
 import importlib
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +24,8 @@ _NAMESPACES = {"ALE": ("ale_py", "atari")}
 _EXTRAS = {"box2d": "box2d", "mujoco": "mujoco", "classic_control": "train"}
 
 
-def make_env(task: str, index: int = 0, image_size: int = 64, action_repeat: int = 1) -> ContractEnv:
-    """The environment of a task string, adapted. `index` numbers the instances of a run, for messages.
+def make_env(task: str, index: int = 0, image_size: int = 64, action_repeat: int = 1, info_metrics: Sequence[str] = ()) -> ContractEnv:
+    """The environment of a task string, adapted. `index` numbers the instances of a run, for messages. The others: see `ContractEnv`.
 
     Raises:
       UserError: an unknown task, a package that is not installed (with the pip command), an unsupported space.
@@ -38,7 +39,7 @@ def make_env(task: str, index: int = 0, image_size: int = 64, action_repeat: int
         env = _make_dm_control(task, name, vision=suite == "dmc_vision", image_size=image_size)
     else:
         env = _make_own(task, suite, name)
-    return ContractEnv(env, task, index, image_size, action_repeat)
+    return ContractEnv(env, task, index, image_size, action_repeat, info_metrics)
 
 
 def _make_gymnasium(task: str, name: str) -> gymnasium.Env[Any, Any]:

@@ -11,13 +11,13 @@ A Dict, also nested, gives one key per entry (`{"arm": {"angle": ...}}` -> `arm_
 """
 
 import dataclasses
+import importlib
 import re
 from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces as gym
-from PIL import Image as Pillow
 
 from spec import Discrete, Image, Spaces, Vector
 from train.errors import UserError
@@ -209,12 +209,22 @@ def _resize(image: np.ndarray, target: Image) -> np.ndarray:
     """[H, W, C] uint8 -> [height, width, C], bilinear. Channel by channel unless RGB: Pillow would take a fourth channel for opacity."""
     if image.shape == target.array_shape:
         return np.array(image, np.uint8)
+    pillow = _pillow(image.shape, target)
     size = (target.width, target.height)
     image = np.ascontiguousarray(image, np.uint8)
     if target.channels == 3:
-        return np.array(Pillow.fromarray(image).resize(size, Pillow.Resampling.BILINEAR))
-    channels = [np.asarray(Pillow.fromarray(image[..., c]).resize(size, Pillow.Resampling.BILINEAR)) for c in range(target.channels)]
+        return np.array(pillow.fromarray(image).resize(size, pillow.Resampling.BILINEAR))
+    channels = [np.asarray(pillow.fromarray(image[..., c]).resize(size, pillow.Resampling.BILINEAR)) for c in range(target.channels)]
     return np.stack(channels, axis=-1)
+
+
+def _pillow(shape: tuple[int, ...], target: Image) -> Any:
+    """Pillow, which acting needs only where an image has another size."""
+    try:
+        return importlib.import_module("PIL.Image")
+    except ModuleNotFoundError as error:
+        sizes = f"{shape[0]} x {shape[1]} pixels to {target.height} x {target.width}"
+        raise UserError(f"resizing an image of {sizes} needs Pillow: pip install pillow") from error
 
 
 # Actions

@@ -9,6 +9,7 @@ import numpy as np
 from reference_numpy.training_loop import derive_seed
 from train.envs.adapter import ContractEnv
 from train.envs.history import Episode, History
+from train.envs.info import EpisodeInfo
 from train.envs.spaces import random_actions
 from train.envs.stream import Failure, Step
 from train.envs.worker import InProcess, OwnProcess, Worker, receive
@@ -46,7 +47,9 @@ class Environments:
         first = make(0)
         self.count = count
         self.spaces = first.spaces
+        self.frame_skip = first.frame_skip
         self.failures = 0  # so far
+        self.info: list[dict[str, float]] = [{}] * count  # of the last records that end an episode: the numbers chosen by --info-metrics
         self._failures_allowed = failures_allowed
         self._failed_at: collections.deque[int] = collections.deque()  # records before each failure, of those in the window
         self._untold: list[Failure] = []
@@ -184,6 +187,7 @@ class Environments:
                 self._episodes[worker] = episode = episode.next()
             episode.add(self._action[worker], is_last=bool(steps[worker][2] or steps[worker][3]))
         self._records += self.count
+        self.info = [steps[worker][4].get("metrics", EpisodeInfo()).values for worker in range(self.count)]
         observations, rewards, terminated, _, _ = zip(*(steps[worker] for worker in range(self.count)), strict=True)
         return {
             **{key: np.stack([observation[key] for observation in observations]) for key in self.spaces.observations},

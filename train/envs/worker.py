@@ -103,7 +103,9 @@ class OwnProcess:
         except GONE:
             return self._failure("crash", self._last_words())
         self._ended = step[2] or step[3]
-        return step[4]["failure"][0] if "failure" in step[4] else step
+        if "failure" in step[4]:
+            return step[4]["failure"][0]
+        return (*step[:4], {"metrics": step[4]["metrics"][0]} if "metrics" in step[4] else {})
 
     def expired(self) -> Failure:
         """The answer that stands for none within `patience` seconds."""
