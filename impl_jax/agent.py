@@ -57,10 +57,12 @@ def policy_step(
     noise: Arrays,
     spaces: Spaces,
     config: Config,
+    mode: bool = False,
 ) -> tuple[dict[str, jax.Array], jax.Array]:
     """One acting step of N rows: (carry, flat action [N, A]). [AGT-11] to [AGT-13]
 
     carry: {"deter" [N, D], "stoch" [N, S, C]}; prev_action [N, A]; noise {"posterior" [N, S], "action" [N, K]}.
+    mode: the action is the mode of the actor, not a sample. [LOOP-71]
     """
     _check_parameters(params, spaces, config)
     require_shape("is_first", is_first, "N")
@@ -74,6 +76,8 @@ def policy_step(
     tokens = networks.encoder(params, observation, spaces, config)
     carry, _ = rssm.observe_step(params, carry, tokens, prev_action, is_first, noise["posterior"], config)
     outputs = networks.actor(params, networks.feature(carry["deter"], carry["stoch"]), spaces, config)
+    if mode:
+        return carry, behavior.mode_action(outputs, spaces, config)
     return carry, behavior.sample_action(outputs, noise["action"], spaces, config)
 
 

@@ -57,6 +57,9 @@ class _Categorical(NamedTuple):
     def sample(self, noise: jax.Array) -> jax.Array:
         return categorical_sample(self.log_probs, noise[..., 0])
 
+    def mode(self) -> jax.Array:
+        return jax.nn.one_hot(jnp.argmax(self.log_probs, -1), self.length, dtype=self.log_probs.dtype)
+
     def log_prob(self, action: jax.Array) -> jax.Array:
         return categorical_log_prob(self.log_probs, action)
 
@@ -74,6 +77,9 @@ class _Normals(NamedTuple):
 
     def sample(self, noise: jax.Array) -> jax.Array:
         return normal_sample(self.mean, self.std, noise)
+
+    def mode(self) -> jax.Array:
+        return self.mean
 
     def log_prob(self, action: jax.Array) -> jax.Array:
         return jnp.sum(normal_log_prob(self.mean, self.std, action), -1)
@@ -105,6 +111,12 @@ def sample_action(outputs: Outputs, noise: jax.Array, spaces: Spaces, config: Co
         actions.append(part.sample(noise[..., start : start + part.noise]))
         start += part.noise
     return jnp.concatenate(actions, -1)
+
+
+def mode_action(outputs: Outputs, spaces: Spaces, config: Config) -> jax.Array:
+    """The mode of the policy as a flat action [..., A], constant. [LOOP-71]"""
+    _check_outputs(outputs, spaces)
+    return jax.lax.stop_gradient(jnp.concatenate([part.mode() for part in _distributions(outputs, spaces, config)], -1))
 
 
 def action_log_prob(outputs: Outputs, action: jax.Array, spaces: Spaces, config: Config) -> jax.Array:

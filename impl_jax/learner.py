@@ -53,7 +53,7 @@ class Learner:
             state = jax.jit(_initial_state, static_argnums=1)(np.uint32(seed), _Static(spaces, config))
         self._state = jax.device_put(state, self._device)
         self._stopped = self._flag(False)  # on the device: no train step waits for the one before
-        self._policy = jax.jit(self._policy_function)
+        self._policy = jax.jit(self._policy_function, static_argnames="mode")
         self._train = jax.jit(self._train_function, donate_argnums=0)
         self._gradients = jax.jit(self._gradients_function)
         self._predict = jax.jit(self._predict_function, static_argnums=4)
@@ -81,15 +81,18 @@ class Learner:
         statistics = None if self._device.platform == "cpu" else self._device.memory_stats()
         return statistics and statistics.get("bytes_in_use")
 
-    def policy(self, observation: Arrays, is_first: np.ndarray, carry: Any, seed: int) -> tuple[np.ndarray, Arrays, Any]:
+    def policy(
+        self, observation: Arrays, is_first: np.ndarray, carry: Any, seed: int, mode: bool = False
+    ) -> tuple[np.ndarray, Arrays, Any]:
         """One acting step of N environments. [AGT-11]
 
-        observation: key -> [N, ...]; is_first [N]; seed: of the random numbers. Returns the flat action [N, A], the latents
+        observation: key -> [N, ...]; is_first [N]; seed: of the random numbers; mode: the action is the mode of the actor,
+        [LOOP-71]. Returns the flat action [N, A], the latents
         {"deter" [N, D], "stoch" [N, S] class indices}, which may still be computing, and the new carry.
         """
         inputs = {key: np.asarray(observation[key]) for key in self.spaces.observations if key in observation}
         inputs = jax.device_put((inputs, np.asarray(is_first, bool)), self._device)
-        carry, latents = self._policy(self._state["params"], carry, *inputs, np.uint32(seed))
+        carry, latents = self._policy(self._state["params"], carry, *inputs, np.uint32(seed), mode=mode)
         return np.asarray(carry["action"]), latents, carry
 
     def train_step(self, batch: Arrays, seed: int) -> tuple[Mapping[str, Any], Arrays]:
@@ -155,11 +158,13 @@ class Learner:
             raise ValueError(f"the train batch lacks {', '.join(missing)}; it has {', '.join(sorted(batch))}")
         return jax.device_put({key: batch[key] for key in self._batch_keys}, self._device)
 
-    def _policy_function(self, params: Any, carry: Any, observation: Any, is_first: jax.Array, seed: jax.Array) -> tuple[Any, Any]:
+    def _policy_function(
+        self, params: Any, carry: Any, observation: Any, is_first: jax.Array, seed: jax.Array, *, mode: bool
+    ) -> tuple[Any, Any]:
         shape = is_first.shape
         noise = _noise(seed, {"posterior": (*shape, self.config.stoch)}, shape, self.spaces, self.config)
         latents = {"deter": carry["deter"], "stoch": carry["stoch"]}
-        latents, action = agent.policy_step(params, latents, carry["action"], observation, is_first, noise, self.spaces, self.config)
+        latents, action = agent.policy_step(params, latents, carry["action"], observation, is_first, noise, self.spaces, self.config, mode)
         return latents | {"action": action}, self._stored(latents)
 
     def _train_function(self, state: Any, stopped: jax.Array, batch: Any, seed: jax.Array) -> tuple[Any, jax.Array, Any, Any]:

@@ -13,6 +13,7 @@ from impl_torch.behavior import (
     action_log_prob,
     actor_loss,
     critic_loss,
+    mode_action,
     replay_critic_loss,
     sample_action,
     update_slow_critic,
@@ -71,16 +72,18 @@ def policy_step(
     noise: Mapping[str, Tensor],
     spaces: Spaces,
     config: Config,
+    mode: bool = False,
 ) -> tuple[dict[str, Tensor], Tensor]:
     """One acting step of N rows: the new carry and the flat action [N, A]. [AGT-11] [AGT-12] [AGT-13]
 
     carry of N rows, prev_action [N, A], observation {key: [N, ...]}, is_first [N], noise {"posterior" [N, S], "action" [N, K]}.
+    mode: the action is the mode of the actor, not a sample. [LOOP-71]
     """
     params = prepare(params, config)
     tokens = encoder(params, observation, spaces, config)
     carry, _ = observe_step(params, carry, tokens, prev_action, is_first, noise["posterior"], config)
     outputs = actor(params, feature(carry["deter"], carry["stoch"]), spaces, config)
-    return dict(carry), sample_action(outputs, noise["action"], spaces, config)
+    return dict(carry), mode_action(outputs, spaces, config) if mode else sample_action(outputs, noise["action"], spaces, config)
 
 
 def losses(

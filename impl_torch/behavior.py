@@ -38,6 +38,9 @@ class _Categorical:
     def sample(self, noise: Tensor) -> Tensor:
         return categorical_sample(self.log_probs, noise.squeeze(-1))
 
+    def mode(self) -> Tensor:
+        return torch.eye(self.log_probs.shape[-1]).to(self.log_probs)[self.log_probs.argmax(-1)]
+
     def log_prob(self, action: Tensor) -> Tensor:
         return categorical_log_prob(self.log_probs, action)
 
@@ -58,6 +61,9 @@ class _Normal:
 
     def sample(self, noise: Tensor) -> Tensor:
         return normal_sample(self.mean, self.std, noise)
+
+    def mode(self) -> Tensor:
+        return self.mean
 
     def log_prob(self, action: Tensor) -> Tensor:
         return normal_log_prob(self.mean, self.std, action).sum(-1)
@@ -94,6 +100,12 @@ def sample_action(outputs: Outputs, noise: Tensor, spaces: Spaces, config: Confi
     expect_shape("noise", noise, (*_leading(outputs), spaces.action_noise_size))
     pieces = noise.split([part.sizes[1] for part in parts], -1)
     return torch.cat([part.sample(piece) for part, piece in zip(parts, pieces, strict=True)], -1)
+
+
+@torch.no_grad()
+def mode_action(outputs: Outputs, spaces: Spaces, config: Config) -> Tensor:
+    """The mode of the policy as a flat action [..., A], constant. [LOOP-71]"""
+    return torch.cat([part.mode() for part in _distributions(outputs, spaces, config)], -1)
 
 
 def action_log_prob(outputs: Outputs, action: Tensor, spaces: Spaces, config: Config) -> Tensor:

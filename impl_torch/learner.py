@@ -87,9 +87,11 @@ class Learner:
 
     @torch.no_grad()
     def policy(
-        self, observation: Arrays, is_first: np.ndarray, carry: Mapping[str, Tensor], seed: int
+        self, observation: Arrays, is_first: np.ndarray, carry: Mapping[str, Tensor], seed: int, mode: bool = False
     ) -> tuple[np.ndarray, Arrays, dict[str, Tensor]]:
         """One acting step: observation {key: [N, ...]}, is_first [N], seed of the noise -> (action [N, A], latents, carry). [AGT-11]
+
+        mode: the action is the mode of the actor, [LOOP-71].
 
         The latents may still be on their way.
         """
@@ -102,7 +104,7 @@ class Learner:
             self._acting = freeze(self.parameters.mapping(), self.config)
         inputs = {key: self._to_device(observation[key]) for key in self.spaces.observations}
         state, action = policy_step(
-            self._acting, carry, carry["action"], inputs, self._to_device(is_first), noise, self.spaces, self.config
+            self._acting, carry, carry["action"], inputs, self._to_device(is_first), noise, self.spaces, self.config, mode
         )
         taken = _to_host(action.float())  # on its way before the latents, which nobody waits for here
         latents = {"deter": _to_host(state["deter"].float()), "stoch": _to_host(state["stoch"].argmax(-1))}

@@ -15,6 +15,7 @@ from reference_numpy.behavior import (
     action_log_prob,
     actor_loss,
     critic_loss,
+    mode_action,
     replay_critic_loss,
     sample_action,
     update_slow_critic,
@@ -138,8 +139,9 @@ def policy_step(
     noise: Mapping[str, Any],
     spaces: Spaces,
     config: Config,
+    mode: bool = False,
 ) -> tuple[dict[str, Array], Array]:
-    """One observation of each row in, one action of each row out. Implements [AGT-11] to [AGT-13]; paper: Critic learning.
+    """One observation of each row in, one action of each row out. Implements [AGT-11] to [AGT-13], [LOOP-71]; paper: Critic learning.
 
     Args:
       carry: {"deter" [N, D], "stoch" [N, S, C]}.
@@ -147,6 +149,7 @@ def policy_step(
       observation: key -> [N, ...], raw.
       is_first: [N] bool.
       noise: {"posterior" [N, S] uniforms, "action" [N, K] uniforms and normals}.
+      mode: the action is the mode of the actor, not a sample; the latents are sampled all the same.
 
     Returns:
       The new carry and the flat action [N, A].
@@ -160,7 +163,7 @@ def policy_step(
     tokens = networks.encoder(params, observation, spaces, config)
     carry, _ = observe_step(params, carry, tokens, prev_action, is_first, noise["posterior"], config)
     outputs = networks.actor(params, networks.feature(carry["deter"], carry["stoch"]), spaces, config)
-    return dict(carry), sample_action(outputs, noise["action"], spaces, config)
+    return dict(carry), mode_action(outputs, spaces, config) if mode else sample_action(outputs, noise["action"], spaces, config)
 
 
 def losses(

@@ -60,6 +60,29 @@ def sample_action(outputs: Outputs, noise: Any, spaces: Spaces, config: Config) 
     return np.asarray(stop_gradient(np.concatenate(parts, axis=-1)))
 
 
+def mode_action(outputs: Outputs, spaces: Spaces, config: Config) -> Array:
+    """The mode of the actor instead of a sample. Implements [LOOP-71]; paper: silent, E-26.
+
+    Args:
+      outputs: as in `sample_action`.
+
+    Returns:
+      [..., A]: one-hot at the most probable class, the first of equals, for every entry of a Discrete; the mean for a Vector.
+
+    Raises:
+      ValueError: wrong keys or shapes.
+    """
+    converted = _checked_outputs(outputs, spaces, config)
+    parts = []
+    for key, space in spaces.actions.items():
+        if isinstance(space, Vector):
+            parts.append(_normal(converted[key], config)[0])
+        else:
+            for log_probs, _ in _categoricals(converted[key]["logits"], space, config):
+                parts.append(np.eye(log_probs.shape[-1])[np.argmax(log_probs, axis=-1)])
+    return np.asarray(stop_gradient(np.concatenate(parts, axis=-1)))
+
+
 def action_log_prob(outputs: Outputs, action: Any, spaces: Spaces, config: Config) -> Array:
     """The log-probability of a flat action. Implements [BEH-2], [BEH-4] to [BEH-6], [BEH-22], [BEH-23].
 

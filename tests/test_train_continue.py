@@ -284,9 +284,12 @@ def test_what_does_not_fit_is_named_and_nothing_is_begun(tmp_path: Path) -> None
     config = options.config
     agent_checkpoint(tmp_path / "old", config, **{"return_range/low": np.float32(np.nan)})
     assert "return_range/low is missing or not as it should be" in message()
-    agent_checkpoint(tmp_path / "old", config, **{"slow_critic/critic/output/bias": np.zeros(7, np.float32)})
-    assert "slow_critic/critic/output/bias" in message()
-    agent_checkpoint(tmp_path / "old", config, **{"params/critic/output/bias": np.full(5, np.inf, np.float32)})
+    state = checkpoint.open_checkpoint(tmp_path / "old").learner
+    name = next(name for name in state if name.startswith("slow_critic/"))
+    agent_checkpoint(tmp_path / "old", config, **{name: np.zeros(7, np.float32)})
+    assert f"{name} is missing or not as it should be" in message()
+    name = next(name for name in state if name.startswith("params/critic/"))
+    agent_checkpoint(tmp_path / "old", config, **{name: np.full_like(state[name], np.inf)})
     assert "numbers that are not finite" in message()
 
 

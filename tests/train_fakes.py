@@ -174,7 +174,7 @@ class FakeLearner:
         return None
 
     def policy(
-        self, observation: Mapping[str, np.ndarray], is_first: np.ndarray, carry: Any, seed: int
+        self, observation: Mapping[str, np.ndarray], is_first: np.ndarray, carry: Any, seed: int, mode: bool = False
     ) -> tuple[np.ndarray, dict[str, np.ndarray], Any]:
         """deter[0] counts the policy steps since the last reset of the row, deter[1] is the seed."""
         assert set(observation) == set(self._spaces.observations)

@@ -49,11 +49,14 @@ class Learner(Protocol):
     def memory(self) -> int | None:
         """Bytes in use on the accelerator; None without one."""
 
-    def policy(self, observation: Arrays, is_first: np.ndarray, carry: Any, seed: int) -> tuple[np.ndarray, Arrays, Any]:
+    def policy(
+        self, observation: Arrays, is_first: np.ndarray, carry: Any, seed: int, mode: bool = False
+    ) -> tuple[np.ndarray, Arrays, Any]:
         """One acting step of N environments: [AGT] policy step.
 
         observation: key -> [N, ...]; is_first: bool [N]. Returns the flat action [N, A], the latents {"deter": [N, D] float32,
         "stoch": [N, S] class indices} and the new carry, which holds the action taken (reset wherever is_first is set next time).
+        mode: the action is the mode of the actor instead of a sample ([LOOP-71]).
         Nothing in the learner changes: evaluating leaves training as it would have been ([LOOP-18]).
         """
 

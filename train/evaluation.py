@@ -1,5 +1,6 @@
 """Episodes that are played but not learned from: evaluation of the agent, and what a random policy gets."""
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -74,20 +75,20 @@ def report_failures(envs: Environments, say: Callable[[str], None]) -> None:
 class Agent:
     """Acts as the learner does, with a carry of its own that starts at zero.
 
-    seed: of the run. step: policy steps of all its evaluations so far.
+    seed: of the run. step: policy steps of all its evaluations so far. mode: takes the mode of the actor, not a sample: [LOOP-71].
     """
 
-    def __init__(self, learner: Learner, envs: Environments, seed: int, step: int) -> None:
+    def __init__(self, learner: Learner, envs: Environments, seed: int, step: int, mode: bool = False) -> None:
         self.step = step
         self._seed = seed
-        self._learner = learner
+        self._policy = functools.partial(learner.policy, mode=True) if mode else learner.policy
         self._carry: Any = learner.initial_carry(envs.count)
         self._keys = list(envs.spaces.observations)
 
     def __call__(self, record: Record) -> np.ndarray:
         observation = {key: record[key] for key in self._keys}
         seed = derive_seed(self._seed, "evaluation", self.step)
-        action, _, self._carry = self._learner.policy(observation, record["is_first"], self._carry, seed)
+        action, _, self._carry = self._policy(observation, record["is_first"], self._carry, seed)
         self.step += 1
         return np.asarray(action)
 

@@ -66,17 +66,20 @@ class Policy:
         self._action = np.zeros((n, self.spaces.action_size))
         self._seed, self._steps = seed, 0
 
-    def __call__(self, observation: Mapping[str, Any], is_first: Any, noise: Mapping[str, Any] | None = None) -> np.ndarray:
-        """One step of every environment: [AGT-11] to [AGT-13].
+    def __call__(
+        self, observation: Mapping[str, Any], is_first: Any, noise: Mapping[str, Any] | None = None, mode: bool = False
+    ) -> np.ndarray:
+        """One step of every environment: [AGT-11] to [AGT-13], [LOOP-71].
 
         Args:
           observation: key -> [n, ...] as in spec/00-notation.md: Vector real numbers [n, size], Discrete integers [n, len(classes)],
             Image uint8 [n, height, width, channels]. Other keys are ignored.
           is_first: [n] bool, where an episode starts: the row forgets what was before.
           noise: {"posterior": [n, S] uniforms, "action": [n, K] uniforms and normals} instead of drawn numbers, see [CON-20].
+          mode: the mode of the actor instead of a sample; the latents are sampled all the same.
 
         Returns:
-          The flat action [n, A], sampled and not clipped; `environment_action` makes of it what an environment takes.
+          The flat action [n, A], not clipped; `environment_action` makes of it what an environment takes.
 
         Raises:
           ValueError: a key is missing, a shape or dtype does not fit, or a number is out of range or not finite. Then nothing has
@@ -92,7 +95,7 @@ class Policy:
         if set(noise) != {"posterior", "action"}:
             raise ValueError(f"noise: expected the entries posterior and action, got {sorted(noise)}")
         carry, action = agent.policy_step(
-            self._parameters, self._carry, self._action, observation, is_first, noise, self.spaces, self.config
+            self._parameters, self._carry, self._action, observation, is_first, noise, self.spaces, self.config, mode
         )
         if not np.isfinite(action).all():  # [LOOP-12]
             raise ValueError("the flat action holds numbers that are not finite: the parameters are probably broken")

@@ -19,11 +19,13 @@ def run_all(runs: Sequence[Options], run: Callable[[Options], bool], say: Callab
     Raises:
       UserError: the first run could not begin.
     """
-    ended, failed, interrupted = [], [], False
+    ended: list[Options] = []
+    failed: list[Options] = []
+    interrupted: Options | None = None
     for number, options in enumerate(runs):
         say(f"seed {options.seed} ({number + 1} of {len(runs)})")
         try:
-            interrupted = not run(options)
+            done = run(options)
         except UserError as error:
             if number == 0 and read_about(options.logdir) is None:
                 raise
@@ -34,7 +36,8 @@ def run_all(runs: Sequence[Options], run: Callable[[Options], bool], say: Callab
             traceback.print_exc()
             failed.append(options)
             continue
-        if interrupted:
+        if not done:
+            interrupted = options
             break
         ended.append(options)
     outcomes = {options.seed: read_outcome(options.logdir) for options in ended}
@@ -43,7 +46,7 @@ def run_all(runs: Sequence[Options], run: Callable[[Options], bool], say: Callab
     for options in failed:
         say(f"seed {options.seed} failed; {options.logdir}")
     if interrupted:
-        say(f"interrupted in seed {options.seed}; the same command continues from there")
+        say(f"interrupted in seed {interrupted.seed}; the same command continues from there")
     if ended:
         say(summary(outcomes))
     return 130 if interrupted else 2 if failed else 0

@@ -23,7 +23,7 @@ from train.options import Options, names_code
 from train.saved_agent import SavedAgent, agent_of
 from train.setup import import_learner, make_learner
 
-DESCRIPTION = """Play episodes with the agent of a checkpoint. It samples its actions, as in training.
+DESCRIPTION = """Play episodes with the agent of a checkpoint. It samples its actions, as in training, unless --mode is given.
 
   train eval runs/CartPole-v1-jax-seed0
   train eval runs/CartPole-v1-jax-seed0/checkpoints/000000020000 --episodes 100 --backend torch --json returns.json"""
@@ -61,27 +61,29 @@ def main(arguments: Sequence[str]) -> int:
         except ValueError as error:
             raise UserError(f"the checkpoint {checkpoint.path} does not fit this version: {error}") from error
         with Display(values.episodes) as display:
-            episodes = play(learner, envs, values.episodes, options.seed, display)
+            episodes = play(learner, envs, values.episodes, options.seed, display, values.mode)
     summary = summarize(episodes)
-    where = f"{options.backend} on {learner.device}"
+    where = f"{options.backend} on {learner.device}{', by the mode' if values.mode else ''}"
     print(f"{checkpoint.path}: {options.task}, step {saved.info['step']:,}; {len(episodes)} episodes with {where}, seed {values.seed}")
     print(sentence(summary))
     if values.json:
         run = {"checkpoint": str(checkpoint.path), "task": options.task, "step": saved.info["step"], "trained_by": saved.info["backend"]}
-        run |= {"backend": options.backend, "device": learner.device, "seed": values.seed}
+        run |= {"backend": options.backend, "device": learner.device, "seed": values.seed, "mode": values.mode}
         lists = {"returns": [episode.score for episode in episodes], "lengths": [episode.length for episode in episodes]}
         with writing(values.json):
             values.json.write_text(json.dumps({**run, **summary, **lists}, indent=2) + "\n", encoding="utf-8")
     return 0
 
 
-def play(learner: Learner, envs: Environments, episodes: int, seed: int, display: Display) -> list[Episode]:
-    """Whole episodes of the learner, with the seeds of a run's first evaluation. seed: takes the place of the run's. [LOOP-19], [LOOP-26]
+def play(learner: Learner, envs: Environments, episodes: int, seed: int, display: Display, mode: bool = False) -> list[Episode]:
+    """Whole episodes of the learner, with the seeds of a run's first evaluation. [LOOP-19], [LOOP-26], [LOOP-71]
+
+    seed: takes the place of the run's. mode: plays the mode of the actor.
 
     Raises:
       UserError: an action that is not finite, or an episode that does not end.
     """
-    agent, ended = Agent(learner, envs, seed, 0), 0
+    agent, ended = Agent(learner, envs, seed, 0, mode), 0
 
     def act(record: Record) -> np.ndarray:
         nonlocal ended
@@ -133,6 +135,9 @@ def _parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of environments and actions; never those of the run (default 0)")
     parser.add_argument(
         "--task", metavar="SUITE:NAME", help="play this task instead; needed where the checkpoint names a module, whose code would run"
+    )
+    parser.add_argument(
+        "--mode", action="store_true", help="the most probable action instead of a sample; latents are sampled all the same"
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the summary and every return and length")
     values = parser.parse_args(arguments)
