@@ -8,11 +8,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
+from conformance.output import never_fail
 from spec import built_profiles, hyperparameters, profiles, sizes
 from train.commands import COMMANDS
 from train.errors import UserError
 from train.options import DEFAULT_PRESET, NONFINITE, PROCESSES, RESUME, Options, make_options, presets
 from train.replay.layout import DETER_DTYPES
+from train.signals import stoppable
 
 DESCRIPTION = """Train a DreamerV3 agent.
 
@@ -34,23 +36,29 @@ GROUPS = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command. Returns the exit code: 0, or 2 after a UserError, or 130 after Ctrl-C."""
-    arguments = sys.argv[1:] if arguments is None else arguments
+    """Runs the command. Returns the exit code: 0, or 2 after a UserError, or 130 after Ctrl-C or another signal."""
+    never_fail()
     try:
-        if arguments and arguments[0] in COMMANDS:
-            command = importlib.import_module(f"train.commands.{arguments[0]}")
-            return command.main(arguments[1:])
-        options = parse(arguments)
-        from train import loop  # Only now: `--help` and mistakes in options shall not wait for Gymnasium.
-
-        return 0 if loop.run(options) else 130
+        with stoppable():
+            return _run(sys.argv[1:] if arguments is None else arguments)
     except UserError as error:
         if error.details:
             print(error.details.rstrip(), file=sys.stderr)
         print(f"train: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as error:
+        print(f"train: interrupted {error}".rstrip(), file=sys.stderr)
         return 130
+
+
+def _run(arguments: Sequence[str]) -> int:
+    if arguments and arguments[0] in COMMANDS:
+        command = importlib.import_module(f"train.commands.{arguments[0]}")
+        return command.main(arguments[1:])
+    options = parse(arguments)
+    from train import loop  # Only now: `--help` and mistakes in options shall not wait for Gymnasium.
+
+    return 0 if loop.run(options) else 130
 
 
 def parse(arguments: Sequence[str]) -> Options:

@@ -115,11 +115,11 @@ def log_episode(run: Run, score: float, length: int) -> None:
     run.logger.write(run.step, run.counters.seconds, {"episode/return": score, "episode/length": length})
 
 
-def run_evaluation(run: Run) -> None:
-    """Plays evaluation episodes with the agent as it is. An interrupted evaluation leaves nothing behind."""
+def run_evaluation(run: Run) -> bool:
+    """Plays evaluation episodes with the agent as it is. An interrupted evaluation leaves nothing behind, and False."""
     options, counters = run.options, run.counters
     if not options.eval_episodes or not run.test_envs:
-        return
+        return True
     agent = Agent(run.learner, run.test_envs, options.seed, counters.evaluation_steps)
     recorder, ended = SequenceRecorder(), 0
 
@@ -134,7 +134,7 @@ def run_evaluation(run: Run) -> None:
     try:
         returns = evaluate(act, run.test_envs, options.eval_episodes, options.seed, counters.evaluations, run.interrupted)
     except Interrupted:
-        return
+        return False
     finally:
         report_failures(run.test_envs, run.display.say)
     errors = show_predictions(run, recorder)
@@ -145,6 +145,7 @@ def run_evaluation(run: Run) -> None:
     if len(returns) > 1:
         metrics["return_standard_error"] = float(np.std(returns, ddof=1)) / math.sqrt(len(returns))
     run.logger.write(run.step, counters.seconds, {f"evaluation/{name}": value for name, value in metrics.items()} | errors)
+    return True
 
 
 def show_predictions(run: Run, recorder: SequenceRecorder) -> dict[str, float]:
@@ -163,14 +164,16 @@ def show_predictions(run: Run, recorder: SequenceRecorder) -> dict[str, float]:
     return prediction_errors(spaces, truth, predicted)
 
 
-def finish(run: Run) -> None:
-    """The last evaluation, the last checkpoint, the picture, and what came of it all."""
+def finish(run: Run) -> bool:
+    """The last evaluation, the last checkpoint, the picture, and what came of it all. Returns False if Ctrl-C ended the evaluation."""
     metrics = mean_metrics(run)
     if metrics:
         run.logger.write(run.step, run.counters.seconds, metrics)
     if run.evaluation is None or run.evaluation["step"] != run.step:
-        resume.save(run)  # An evaluation may take long, and whatever ends it must not cost the training.
-        run_evaluation(run)
+        path = resume.save(run)  # An evaluation may take long, and whatever ends it must not cost the training.
+        if not run_evaluation(run):
+            run.display.say(f"interrupted in the last evaluation, all training is saved in {path}; the same command plays it again")
+            return False
         resume.save(run)
     options = run.options
     title = f"{options.task}, {options.backend}, seed {options.seed}"
@@ -180,6 +183,7 @@ def finish(run: Run) -> None:
         f"{duration(run.counters.seconds)}; curve in {picture}"
     )
     run.display.say(last_words(run))
+    return True
 
 
 def last_words(run: Run) -> str:
