@@ -4,12 +4,14 @@ import contextlib
 import os
 import signal
 import socket
+import sys
 import threading
 from collections.abc import Iterator
 from types import FrameType
 from typing import Any
 
 NUMBERS = tuple(int(getattr(signal, name)) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))  # Windows has no SIGHUP.
+PATIENCE = 2.0  # seconds before it is said that the end takes longer
 
 
 class Stopped(KeyboardInterrupt):
@@ -66,14 +68,23 @@ def _is_the_same(first: int, second: int) -> bool:
 
 def _end_at_the_second(wakeup: socket.socket, numbers: list[int]) -> None:
     """Python calls handlers between its own instructions only. A compiler may take minutes for one: this thread hears of it before."""
+    first = 0
     with wakeup:
-        first = 0
-        while received := wakeup.recv(1):
-            (number,) = received  # Others are those of somebody else's handlers.
+        while True:
+            try:
+                received = wakeup.recv(1)
+            except TimeoutError:
+                print("train: ending when the step under way is done; a second signal ends the process at once", file=sys.stderr)
+                wakeup.settimeout(None)
+                continue
+            if not received:
+                return
+            number = received[0]  # Others than these are those of somebody else's handlers.
             if number in numbers and first and not _is_the_same(first, number):
                 os._exit(128 + number)
-            if number in numbers:
-                first = first or number
+            if number in numbers and not first:
+                first = number
+                wakeup.settimeout(PATIENCE)
 
 
 _active: list[Signals] = []
