@@ -17,7 +17,9 @@ SIZES = {"deter": 8, "units": 4, "stoch": 2, "classes": 2, "batch-size": 2, "bat
 
 # The command as it is, but for a learner that needs no backend; a preflight that lasts, if PREFLIGHT says so.
 COMMAND = """
-import os, sys
+import os, signal, sys
+if hasattr(signal, "SIGHUP"):
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # Under nohup it would be ignored.
 from train import cli, setup
 from train_fakes import FakeLearner
 from train_surroundings import arrive
@@ -43,6 +45,33 @@ def arrive(how: str) -> None:
         hashlib.pbkdf2_hmac("sha256", b"", b"", 2**31 - 1)
     if how == "lock":  # One call that lets no other thread run.
         ctypes.PyDLL(None).sleep(1000)
+
+
+class Talking(Counting):
+    """Says something in every step."""
+
+    def step(self, action: np.ndarray) -> Any:
+        print("a word from the environment " * 100)
+        return super().step(action)
+
+
+class WordlessError(Exception):
+    def __str__(self) -> str:
+        raise ValueError("no words")
+
+
+class Unprintable(Counting):
+    """Raises two errors, in whatever processes, that are hard to print."""
+
+    def step(self, action: np.ndarray) -> Any:
+        with open(os.environ["ARRIVED"], "ab") as file:
+            file.write(b".")
+        number = Path(os.environ["ARRIVED"]).stat().st_size
+        if number == 8:
+            raise ValueError("\N{MIDDLE DOT} \udcff")
+        if number == 16:
+            raise WordlessError
+        return super().step(action)
 
 
 class Evaluated(Counting):
@@ -79,20 +108,23 @@ class Stuck(Counting):
             arrive(self._how)
 
 
-def start(task: str, logdir: Path, *more: str, output: Any = subprocess.PIPE, **variables: str) -> "subprocess.Popen[str]":
-    """A run of 60 steps with a fake learner, in a process of its own."""
+def start(
+    task: str, logdir: Path, *more: str, output: Any = subprocess.PIPE, shell: str = 'exec "$@"', **variables: str
+) -> "subprocess.Popen[str]":
+    """A run of 60 steps with a fake learner, in a process of its own. shell: what starts "$@"."""
     sizes = [word for name, value in SIZES.items() for word in (f"--{name}", str(value))]
     run = ["--backend", "jax", "--task", f"train_surroundings:{task}", "--steps", "60", "--logdir", str(logdir), "--log-every", "0"]
     schedule = ["--eval-every", "0", "--eval-episodes", "1", "--random-episodes", "0"]
     preflight = [] if "PREFLIGHT" in variables else ["--no-preflight"]
     environment = {**os.environ, "PYTHONPATH": str(ROOT / "tests"), "ARRIVED": str(logdir.with_name("arrived")), **variables}
     return subprocess.Popen(
-        [sys.executable, "-c", COMMAND, *run, *schedule, *preflight, *sizes, *more],
+        ["sh", "-c", shell, "sh", sys.executable, "-c", COMMAND, *run, *schedule, *preflight, *sizes, *more],
         cwd=ROOT,
         env=environment,
         stdout=output,
         stderr=subprocess.PIPE if output is subprocess.PIPE else output,
         text=True,
+        errors="replace",
     )
 
 
