@@ -9,10 +9,12 @@ from rich.console import Console
 
 from conformance.commands import COMMANDS
 from conformance.errors import UserError
+from conformance.output import never_fail
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Returns 0 when everything that was asked holds, 1 when it does not, 2 for a wrong command line, 130 after Ctrl-C."""
+    never_fail()
     parser = argparse.ArgumentParser(prog="conformance", description="Checks an implementation of DreamerV3 against the specification.")
     commands = parser.add_subparsers(dest="command", required=True)
     modules = {name.replace("_", "-"): importlib.import_module(f"conformance.commands.{name}") for name in COMMANDS}

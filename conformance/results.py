@@ -136,10 +136,10 @@ def write(path: Path, report: Data) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Raises UserError where that is not possible."""
+    """Characters of a candidate's messages that no encoding has are escaped. Raises UserError where it is not possible."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")
+        path.write_text(text, encoding="utf-8", errors="backslashreplace")
     except OSError as error:
         raise UserError(f"cannot write {path}: {error.strerror}") from error
 

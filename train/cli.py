@@ -14,12 +14,14 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
+from conformance.output import never_fail
 from spec import built_profiles, hyperparameters, profiles, sizes
 from train.commands import COMMANDS
 from train.errors import UserError
 from train.machine import own_version
 from train.options import DEFAULT_PRESET, NONFINITE, PROCESSES, RESUME, Options, did_you_mean, make_options, of_seeds, presets
 from train.replay.layout import DETER_DTYPES
+from train.signals import stoppable
 
 BACKENDS = ("jax", "torch")
 USAGE = "train --backend {jax,torch} [options]\n       train COMMAND ... (train COMMAND --help says more)"
@@ -45,24 +47,16 @@ GROUPS = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command. Returns the exit code: 0, or 2 after a UserError, or 130 after Ctrl-C."""
-    arguments = sys.argv[1:] if arguments is None else arguments
+    """Runs the command. Returns the exit code: 0, or 2 after a UserError, or 130 after Ctrl-C or another signal."""
+    never_fail()
     try:
-        if arguments and not arguments[0].startswith("-"):
-            name = arguments[0]
-            if name not in COMMANDS:
-                raise UserError(f"unknown command {name!r}{did_you_mean(name, COMMANDS)} (see train --help)")
-            return importlib.import_module(f"train.commands.{name}").main(arguments[1:])
-        runs = parse_runs(arguments)
-        from train import loop, seeds  # Only now: `--help` and mistakes in options shall not wait for Gymnasium.
-
-        if len(runs) > 1:
-            return seeds.run_all(runs, loop.run)
-        return 0 if loop.run(runs[0]) else 130
+        with stoppable():
+            return _run(sys.argv[1:] if arguments is None else arguments)
     except UserError as error:
         say_error(error)
         return 2
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as error:
+        print(f"train: interrupted {error}".rstrip(), file=sys.stderr)
         return 130
 
 
@@ -71,6 +65,20 @@ def say_error(error: UserError) -> None:
     if error.details:
         print(error.details.rstrip(), file=sys.stderr)
     print(f"train: error: {' '.join(str(error).split())}", file=sys.stderr)
+
+
+def _run(arguments: Sequence[str]) -> int:
+    if arguments and not arguments[0].startswith("-"):
+        name = arguments[0]
+        if name not in COMMANDS:
+            raise UserError(f"unknown command {name!r}{did_you_mean(name, COMMANDS)} (see train --help)")
+        return importlib.import_module(f"train.commands.{name}").main(arguments[1:])
+    runs = parse_runs(arguments)
+    from train import loop, seeds  # Only now: `--help` and mistakes in options shall not wait for Gymnasium.
+
+    if len(runs) > 1:
+        return seeds.run_all(runs, loop.run)
+    return 0 if loop.run(runs[0]) else 130
 
 
 def parse(arguments: Sequence[str]) -> Options:

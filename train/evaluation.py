@@ -8,7 +8,7 @@ import numpy as np
 
 from reference_numpy.training_loop import derive_seed
 from train.backend import Learner
-from train.envs import Environments, Record, random_actions
+from train.envs import Environments, Failure, Record, random_actions
 from train.errors import UserError
 
 LONGEST_EPISODE = 108_000  # records
@@ -67,9 +67,14 @@ def play_episodes(envs: Environments, act: Act, episodes: int, seeds: list[int],
 
 
 def report_failures(envs: Environments, say: Callable[[str], None]) -> None:
-    """Says which environments had to be made anew since the last call."""
+    """Says which environments failed since the last call."""
     for failure in envs.take_failures():
-        say(f"environment {failure.worker} was made anew, its episode is abandoned ({failure.kind}): {failure.message}")
+        report_failure(failure, say)
+
+
+def report_failure(failure: Failure, say: Callable[[str], None]) -> None:
+    kind = "invalid data" if failure.kind == "garbage" else failure.kind
+    say(f"environment {failure.worker} failed and was restarted ({kind}): {failure.message}")
 
 
 class Agent:

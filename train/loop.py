@@ -1,12 +1,8 @@
 """The loop of spec/12-training-loop.md: act, remember, learn."""
 
-import os
-import signal
 import time
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
-from types import FrameType
-from typing import Any
+from collections.abc import Mapping
+from contextlib import ExitStack
 
 import numpy as np
 
@@ -19,6 +15,7 @@ from train.finite import finite_action, settle
 from train.options import Options
 from train.schedule import Schedule, finish, log_episode
 from train.setup import prepare
+from train.signals import Stopped, stoppable
 from train.state import Run, TrainStep
 
 
@@ -29,19 +26,22 @@ def run(options: Options, learner: type[Learner] | None = None) -> bool:
 
     Raises:
       UserError: whatever the user can mend; see train/cli.py.
+      Stopped: a signal came before training began, so there was nothing to save.
     """
-    with ExitStack() as stack:
-        run = prepare(options, learner, stack)
-        finished = train(run)
-        if finished:
-            finish(run)
-        return finished
+    with stoppable() as signals, signals.polled(), ExitStack() as stack:
+        try:
+            with signals.polled(False):
+                run = prepare(options, learner, stack)
+        except KeyboardInterrupt as error:
+            raise Stopped("before training began: there was nothing to save, and nothing is lost") from error
+        return train(run) and finish(run)
 
 
 def train(run: Run) -> bool:
     """Acts, remembers and learns until the budget of steps is used up. Returns False if Ctrl-C ended it; then a checkpoint is written."""
-    schedule = Schedule(run)
-    with _interruptible(run.interrupted):
+    with stoppable() as signals, signals.polled():
+        run.interrupted = signals.received
+        schedule = Schedule(run)
         schedule.evaluate(run)
         while run.step < run.options.steps and not run.interrupted:
             act(run)
@@ -103,39 +103,3 @@ def learn(run: Run) -> None:
         settle(run)
     run.counters.train_steps += 1
     run.unsettled = TrainStep(number, seed, batch, metrics)
-
-
-@contextmanager
-def _interruptible(received: list[int]) -> Iterator[None]:
-    """The first Ctrl-C, termination signal or closed terminal is added to the list; the next one works as always.
-
-    Under `nohup` a closed terminal is ignored, as it wants.
-    """
-    previous: dict[int, Any] = {}
-    terminals = [descriptor for descriptor in (0, 1, 2) if os.isatty(descriptor)]  # After the end they no longer say so.
-
-    def receive(number: int, frame: FrameType | None) -> None:
-        received.append(number)
-        signal.signal(number, previous[number])
-        if number == signal.SIGHUP:
-            _silence(terminals)
-
-    try:
-        for number in (int(signal.SIGINT), int(signal.SIGTERM), int(signal.SIGHUP)):
-            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
-                previous[number] = signal.signal(number, receive)
-    except ValueError:  # Not in the main thread: signals are somebody else's.
-        previous.clear()
-    try:
-        yield
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
-
-
-def _silence(terminals: Iterable[int]) -> None:
-    """What is still said goes nowhere: on a terminal that is closed, every write would be an error."""
-    nowhere = os.open(os.devnull, os.O_RDWR)
-    for descriptor in terminals:
-        os.dup2(nowhere, descriptor)
-    os.close(nowhere)

@@ -124,11 +124,11 @@ def log_episode(run: Run, score: float, length: int, info: Mapping[str, float]) 
         run.display.say(f"WARNING: the info of the first episode's last step does not have {', '.join(missing)} (--info-metrics)")
 
 
-def run_evaluation(run: Run) -> None:
-    """Plays evaluation episodes with the agent as it is. An interrupted evaluation leaves nothing behind."""
+def run_evaluation(run: Run) -> bool:
+    """Plays evaluation episodes with the agent as it is. An interrupted evaluation leaves nothing behind, and False."""
     options, counters = run.options, run.counters
     if not options.eval_episodes or not run.test_envs:
-        return
+        return True
     agent = Agent(run.learner, run.test_envs, options.seed, counters.evaluation_steps)
     recorder, ended = SequenceRecorder(), 0
 
@@ -143,7 +143,7 @@ def run_evaluation(run: Run) -> None:
     try:
         episodes = evaluate(act, run.test_envs, options.eval_episodes, options.seed, counters.evaluations, run.interrupted)
     except Interrupted:
-        return
+        return False
     finally:
         report_failures(run.test_envs, run.display.say)
     returns = [episode.score for episode in episodes]
@@ -156,6 +156,7 @@ def run_evaluation(run: Run) -> None:
         metrics["return_standard_error"] = float(np.std(returns, ddof=1)) / math.sqrt(len(returns))
     metrics |= {f"info/{name}": value for name, value in mean_info(episodes).items()}
     run.logger.write(run.step, counters.seconds, {f"evaluation/{name}": value for name, value in metrics.items()} | errors)
+    return True
 
 
 def mean_info(episodes: Sequence[Episode]) -> dict[str, float]:
@@ -180,14 +181,16 @@ def show_predictions(run: Run, recorder: SequenceRecorder) -> dict[str, float]:
     return prediction_errors(spaces, truth, predicted)
 
 
-def finish(run: Run) -> None:
-    """The last evaluation, the last checkpoint, the picture, and what came of it all."""
+def finish(run: Run) -> bool:
+    """The last evaluation, the last checkpoint, the picture, and what came of it all. Returns False if Ctrl-C ended the evaluation."""
     metrics = mean_metrics(run)
     if metrics:
         run.logger.write(run.step, run.counters.seconds, metrics)
     if run.evaluation is None or run.evaluation["step"] != run.step:
-        resume.save(run)  # An evaluation may take long, and whatever ends it must not cost the training.
-        run_evaluation(run)
+        path = resume.save(run)  # An evaluation may take long, and whatever ends it must not cost the training.
+        if not run_evaluation(run):
+            run.display.say(f"interrupted in the last evaluation, all training is saved in {path}; the same command plays it again")
+            return False
         resume.save(run)
     options = run.options
     title = f"{options.task}, {options.backend}, seed {options.seed}"
@@ -200,6 +203,7 @@ def finish(run: Run) -> None:
         run.display.say(f"WARNING: no train step was made, the agent is as it began: {why_untrained(options)}")
     run.display.say("next: " + "\n      ".join(next_commands(options, run.step)))
     run.display.say(last_words(read_outcome(options.logdir), run.counters.train_steps))
+    return True
 
 
 def say_outlook(run: Run) -> None:

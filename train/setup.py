@@ -15,11 +15,11 @@ from train import checkpoint, resume, threads
 from train.about import write_about
 from train.backend import Learner, learner_class
 from train.checkpoint import Checkpoint
-from train.envs import Environments, Record, is_slow, make_env
+from train.envs import Environments, Record, make_env, try_out
 from train.envs.frames import repeated_twice
 from train.envs.info import names_of
 from train.errors import UserError
-from train.evaluation import play_randomly
+from train.evaluation import play_randomly, report_failure
 from train.forecast import say_memory
 from train.logger import Display, Logger
 from train.options import Options
@@ -43,7 +43,7 @@ def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -
     display = stack.enter_context(Display(options.steps))
     saved = _find_checkpoint(options, display)
     learner_type = learner or import_learner(options.backend)
-    envs, test_envs = _make_environments(options, stack)
+    envs, test_envs = _make_environments(options, display, stack)
     if warning := repeated_twice(options.task, envs.frame_skip, options.action_repeat):
         display.say(warning)
     if saved:
@@ -181,7 +181,7 @@ def import_learner(backend: str) -> type[Learner]:
         raise UserError(f"the backend {backend} needs the package {error.name}: pip install 'dreamer-spec[{backend}]'") from error
 
 
-def _make_environments(options: Options, stack: ExitStack) -> tuple[Environments, Environments | None]:
+def _make_environments(options: Options, display: Display, stack: ExitStack) -> tuple[Environments, Environments | None]:
     """The environments of training, and those of evaluation if there is any."""
     make = functools.partial(
         make_env,
@@ -190,14 +190,19 @@ def _make_environments(options: Options, stack: ExitStack) -> tuple[Environments
         action_repeat=options.action_repeat,
         info_metrics=names_of(options.info_metrics),
     )
-    count, processes = options.config.envs, options.processes == "yes"
-    if options.processes == "auto" and count > 1:
-        processes = is_slow(make, options.seed)
-    envs = stack.enter_context(closing(Environments(make, count, processes, options.env_timeout, options.env_failures)))
-    tests = min(count, max(options.eval_episodes, options.random_episodes))
-    if not tests:
-        return envs, None
-    return envs, stack.enter_context(closing(Environments(make, tests, processes, options.env_timeout, options.env_failures)))
+    trial = None
+    if options.processes != "no":
+        display.phase("an environment is tried out")
+        seed = options.seed if options.processes == "auto" else None
+        trial = try_out(make, lambda failure: report_failure(failure, display.say), options.task, seed, options.env_timeout)
+
+    def several(count: int) -> Environments:
+        processes = trial is not None and trial.deserves_process
+        made = Environments(make, count, processes, options.env_timeout, options.env_failures, trial, options.task)
+        return stack.enter_context(closing(made))
+
+    tests = min(options.config.envs, max(options.eval_episodes, options.random_episodes))
+    return several(options.config.envs), several(tests) if tests else None
 
 
 def _count_parameters(options: Options, spaces: Spaces) -> int:

@@ -6,7 +6,7 @@ import json
 import math
 import statistics
 from collections.abc import Mapping, Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +15,9 @@ from reference_numpy.training_loop import derive_seed
 from train.backend import Learner
 from train.checkpoint import open_checkpoint
 from train.cli import BACKENDS, Parser
-from train.envs import Environments, Record, is_slow, make_env
+from train.envs import Environments, Record, make_env, try_out
 from train.errors import UserError, writing
-from train.evaluation import Agent, Episode, play_episodes, report_failures
+from train.evaluation import Agent, Episode, play_episodes, report_failure, report_failures
 from train.logger import Display
 from train.options import Options, names_code
 from train.saved_agent import SavedAgent, agent_of
@@ -52,7 +52,11 @@ def main(arguments: Sequence[str]) -> int:
     learner_type = import_learner(options.backend)
     make = functools.partial(make_env, options.task, image_size=options.image_size, action_repeat=options.action_repeat)
     count = min(saved.config.envs, values.episodes)
-    with closing(Environments(make, count, count > 1 and is_slow(make, options.seed))) as envs:
+    with ExitStack() as stack:
+        display = stack.enter_context(Display(values.episodes))
+        trial = try_out(make, lambda failure: report_failure(failure, display.say), options.task, options.seed, options.env_timeout)
+        envs = Environments(make, count, trial.deserves_process, options.env_timeout, options.env_failures, trial, options.task)
+        stack.enter_context(closing(envs))
         if envs.spaces != saved.spaces:
             raise UserError(f"the task {options.task} has the spaces {envs.spaces}; the agent of {checkpoint.path} has {saved.spaces}")
         learner = make_learner(learner_type, options, saved.spaces)
@@ -60,8 +64,7 @@ def main(arguments: Sequence[str]) -> int:
             learner.load_state_dict(checkpoint.learner)
         except ValueError as error:
             raise UserError(f"the checkpoint {checkpoint.path} does not fit this version: {error}") from error
-        with Display(values.episodes) as display:
-            episodes = play(learner, envs, values.episodes, options.seed, display, values.mode)
+        episodes = play(learner, envs, values.episodes, options.seed, display, values.mode)
     summary = summarize(episodes)
     where = f"{options.backend} on {learner.device}{', by the mode' if values.mode else ''}"
     print(f"{checkpoint.path}: {options.task}, step {saved.info['step']:,}; {len(episodes)} episodes with {where}, seed {values.seed}")

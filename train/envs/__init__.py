@@ -2,10 +2,11 @@
 
 from train.envs.adapter import ContractEnv
 from train.envs.factory import make_env
+from train.envs.failure import Failure
 from train.envs.history import History
 from train.envs.spaces import Translation, random_actions, translate
-from train.envs.stream import Failure
-from train.envs.vector import Environments, Record, is_slow
+from train.envs.trial import Trial, try_out
+from train.envs.vector import Environments, Record
 
 __all__ = [
     "ContractEnv",
@@ -14,8 +15,9 @@ __all__ = [
     "History",
     "Record",
     "Translation",
-    "is_slow",
+    "Trial",
     "make_env",
     "random_actions",
     "translate",
+    "try_out",
 ]

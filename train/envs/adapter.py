@@ -86,14 +86,15 @@ class ContractEnv(gymnasium.Env[Observation, np.ndarray]):
                 raise self._garbage(
                     f"step returned {_describe(value)}; Gymnasium's step returns (observation, reward, terminated, truncated, info)"
                 )
-            observation, reward, terminated, truncated, info = value
+            observation, reward, _, _, info = value
             total += self._reward(reward)
+            terminated, truncated = self._flag("terminated", value[2]), self._flag("truncated", value[3])
             if terminated or truncated:
                 break
         if abs(total) > FLOAT32_MAX:
             raise self._garbage(f"the rewards of {self._action_repeat} repeated actions add up to {total}, more than float32 can hold")
         extra = {"metrics": self._metrics(info)} if self._info_metrics and (terminated or truncated) else {}
-        return self._observation(observation), total, bool(terminated), bool(truncated), extra
+        return self._observation(observation), total, terminated, truncated, extra
 
     def close(self) -> None:
         self._env.close()
@@ -118,6 +119,13 @@ class ContractEnv(gymnasium.Env[Observation, np.ndarray]):
         if not math.isfinite(reward) or abs(reward) > FLOAT32_MAX:
             raise self._garbage(f"the reward is {reward}; expected a finite number")
         return reward
+
+    def _flag(self, name: str, value: Any) -> bool:
+        """Python finds a truth in everything: a NaN or the text "False" would end the episode. [LOOP-47]"""
+        array = np.asarray(value)
+        if array.size != 1 or array.dtype.kind not in "biu" or array.item() not in (0, 1):
+            raise self._garbage(f"{name} is {f'{value!r}'[:80]}; expected True or False")
+        return bool(array.item())
 
     def _garbage(self, message: str) -> Garbage:
         return Garbage(f"{where(self.task, self._index, self._steps)}: {message}")

@@ -1,4 +1,4 @@
-"""N environments side by side, each a stream of records as in spec/00-notation.md, and each made anew when it fails."""
+"""N environments side by side, each a stream of records as in spec/00-notation.md, and each restarted when it fails."""
 
 import collections
 import time
@@ -7,17 +7,19 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 import numpy as np
 
 from reference_numpy.training_loop import derive_seed
+from spec import Spaces
 from train.envs.adapter import ContractEnv
+from train.envs.failure import Failure
 from train.envs.history import Episode, History
 from train.envs.info import EpisodeInfo
-from train.envs.spaces import random_actions
-from train.envs.stream import Failure, Step
+from train.envs.process import Packed
+from train.envs.stream import Step
+from train.envs.trial import Trial, make_here, try_out
 from train.envs.worker import InProcess, OwnProcess, Worker, receive
 from train.errors import UserError
 
 Record = dict[str, np.ndarray]
 
-SLOW_STEP = 5e-4  # seconds; from here on a process of its own is faster than taking turns
 WINDOW = 100_000  # records of all workers among which failures are counted
 CLOSING = 5.0  # seconds that environments have to close by themselves
 
@@ -28,43 +30,52 @@ class Environments:
     make: index -> environment; must be picklable by cloudpickle.
     timeout: seconds that a step, or a reset with the making before it, may take. Only a process of its own can be held to it: an
     environment in this process that hangs stops everything, and nobody notices.
-    failures_allowed: within 100,000 records of all workers together.
+    failures_allowed: within 100,000 records of all workers together. trial: what is known of these environments, if they have been tried
+    out. task: for messages, where they have not.
 
     `start(action)` sends the actions off, `finish()` waits for the records: what happens in between overlaps with the environments where
     they have processes of their own. `reset(seeds)` begins everywhere anew, and seeds this episode and all after it.
 
-    An environment that crashes, raises, hangs or returns what its spaces do not allow is made anew and reset; its next record has
-    `is_first`, and the others go on undisturbed: [LOOP-32].
+    An environment that crashes, raises, hangs or returns what its spaces do not allow is restarted: another is made and reset; its next
+    record has `is_first`, and the others go on undisturbed: [LOOP-32].
 
     Raises:
-      UserError: from here, if the first environment cannot be made; from `reset` and `finish`, if an environment fails before it has given
-      a record, or if there were too many failures.
+      UserError: from here, if the first environment cannot be made; from `reset` and `finish`, if an environment gives no first record in
+      three attempts ([LOOP-46]), or if there were too many failures.
     """
 
     def __init__(
-        self, make: Callable[[int], ContractEnv], count: int, processes: bool, timeout: float = 600.0, failures_allowed: int = 10
+        self,
+        make: Callable[[int], ContractEnv],
+        count: int,
+        processes: bool,
+        timeout: float = 600.0,
+        failures_allowed: int = 10,
+        trial: Trial | None = None,
+        task: str = "",
     ) -> None:
-        first = make(0)
         self.count = count
-        self.spaces = first.spaces
-        self.frame_skip = first.frame_skip
         self.failures = 0  # so far
         self.info: list[dict[str, float]] = [{}] * count  # of the last records that end an episode: the numbers chosen by --info-metrics
         self._failures_allowed = failures_allowed
         self._failed_at: collections.deque[int] = collections.deque()  # records before each failure, of those in the window
         self._untold: list[Failure] = []
+        self._attempts = collections.Counter[int]()  # of each worker to give its first record
         self._records = 0
+        first = None if processes else make_here(make, self._count, task)
+        known = first or trial or try_out(make, self._count, task, timeout=timeout)
+        self.spaces: Spaces = known.spaces
+        self.frame_skip: int = known.frame_skip
         self._episodes: dict[int, Episode] = {}
         self._action = np.zeros((count, self.spaces.action_size), np.float32)
         self._pending = False  # whether actions were sent off whose records have not been asked for
         self._workers: list[Worker] = []
+        packed = Packed(make) if processes else None
         for index in range(count):
-            if processes:
-                self._workers.append(OwnProcess(make, index, first.task, self.spaces, timeout))
+            if packed:
+                self._workers.append(OwnProcess(packed, index, known.task, self.spaces, timeout))
             else:
-                self._workers.append(InProcess(make, index, first.task, self.spaces, None if index else first))
-        if processes:
-            first.close()
+                self._workers.append(InProcess(make, index, known.task, self.spaces, None if index else first))
 
     def reset(self, seeds: Sequence[int]) -> Record:
         """The first records of new episodes, [N, ...] each."""
@@ -142,7 +153,7 @@ class Environments:
         self._episodes[worker] = Episode(history)
 
     def _receive(self) -> dict[int, Step]:
-        """One step of every worker; those that fail are made anew until they give the first record of an episode: [LOOP-32]."""
+        """One step of every worker; those that fail are restarted until they give the first record of an episode: [LOOP-32]."""
         steps, failures = self._ask(range(self.count))
         while failures:
             for failure in failures:
@@ -166,8 +177,9 @@ class Environments:
         self._failed_at.append(self._records)
         while self._failed_at[0] <= self._records - WINDOW:
             self._failed_at.popleft()
-        if not self._records:
-            raise UserError(failure.message, failure.details)
+        self._attempts[failure.worker] += not self._records
+        if not self._records and failure.is_final(self._attempts[failure.worker]):
+            raise failure.error(self._attempts[failure.worker])
         if len(self._failed_at) > self._failures_allowed:
             raise UserError(
                 f"{failure.message}; the environments failed {len(self._failed_at)} times within {WINDOW:,} records, "
@@ -196,20 +208,3 @@ class Environments:
             "is_last": np.array([episode.is_last for episode in self._episodes.values()]),
             "is_terminal": np.array(terminated, bool),
         }
-
-
-def is_slow(make: Callable[[int], ContractEnv], seed: int) -> bool:
-    """Whether one environment takes long enough for a step to deserve a process: measured, for 0.3 seconds at most."""
-    env = make(0)
-    rng = np.random.default_rng(seed)
-    try:
-        env.reset(seed=seed)
-        start, steps = time.perf_counter(), 0
-        while steps < 100 and time.perf_counter() - start < 0.3:
-            _, _, terminated, truncated, _ = env.step(random_actions(env.spaces, rng, 1)[0])
-            steps += 1
-            if terminated or truncated:
-                env.reset()
-        return (time.perf_counter() - start) / steps > SLOW_STEP
-    finally:
-        env.close()

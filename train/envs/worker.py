@@ -4,8 +4,6 @@ import contextlib
 import functools
 import multiprocessing
 import os
-import signal
-import sys
 import time
 from collections.abc import Callable, Mapping
 from multiprocessing import connection
@@ -17,10 +15,11 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 
 from spec import Spaces
 from train.envs.adapter import ContractEnv, where
+from train.envs.failure import Failure
 from train.envs.history import History
-from train.envs.stream import Failure, Step, Stream
-
-DYING = 5.0  # seconds that a process has to be gone after it was killed
+from train.envs.process import DYING, ended, no_answer, not_started, start_method
+from train.envs.stream import Step, Stream
+from train.signals import unbroken
 
 # What Gymnasium raises where the process has ended: when something is received, when it is sent, and when that had failed.
 GONE = (EOFError, OSError, NoAsyncCallError)
@@ -61,7 +60,7 @@ class InProcess:
 
 
 class OwnProcess:
-    """A vector environment of one: its process can be killed and made anew, and no other worker notices.
+    """A vector environment of one: its process can be killed and another started, and no other worker notices.
 
     timeout: seconds for an answer. patience: the same, or more while actions are replayed. pipe: through which the answer comes.
     """
@@ -73,6 +72,7 @@ class OwnProcess:
         self._wait: Callable[[float | None], Step] = self._wait_for_reset
         self._steps = 0
         self._ended = False
+        self._not_started = ""  # why it has no process
         self.patience = timeout
         self.pipe: connection.Connection | None = None
 
@@ -84,12 +84,19 @@ class OwnProcess:
     def begin(self, history: History) -> None:
         replayed = len(history.actions)
         self._wait, self.patience, self._steps = self._wait_for_reset, self._timeout * (1 + replayed), replayed
+        if self._envs is None:
+            self._start()
         with contextlib.suppress(*GONE):  # `receive` will say so.
-            if self._envs is None:
+            self._running().reset_async(seed=[history.seed], options={"episode": history.episode, "actions": history.actions})
+
+    def _start(self) -> None:
+        try:
+            with unbroken():
                 makers = [self._make_stream]
-                self._envs = AsyncVectorEnv(makers, copy=False, context=_start_method(), autoreset_mode=AutoresetMode.DISABLED)
+                self._envs = AsyncVectorEnv(makers, copy=False, context=start_method(), autoreset_mode=AutoresetMode.DISABLED)
                 (self.pipe,) = self._envs.parent_pipes
-            self._envs.reset_async(seed=[history.seed], options={"episode": history.episode, "actions": history.actions})
+        except Exception as error:  # `receive` will say so.
+            self._not_started = not_started(error)
 
     def step(self, action: np.ndarray) -> None:
         self._wait, self.patience = self._wait_for_step, self._timeout
@@ -109,7 +116,7 @@ class OwnProcess:
 
     def expired(self) -> Failure:
         """The answer that stands for none within `patience` seconds."""
-        return self._failure("timeout", f"no answer within {self.patience:g} seconds")
+        return self._failure("timeout", no_answer(self.patience))
 
     def shut(self) -> None:
         with contextlib.suppress(*GONE, AlreadyPendingCallError):
@@ -144,15 +151,13 @@ class OwnProcess:
 
     def _last_words(self) -> str:
         if self._envs is None:
-            return "its process ended before it began; what it said is above"
+            return self._not_started
         self.process.join(DYING)
-        code = self.process.exitcode
-        if code is not None and code < 0:
-            return f"its process was ended by {signal.Signals(-code).name} (killed, or out of memory?)"
-        return f"its process ended with exit code {code}; what it said is above"
+        return ended(self.process.exitcode)
 
     def _failure(self, kind: Literal["crash", "timeout"], what: str) -> Failure:
-        return Failure(self._index, kind, f"{where(self._task, self._index, self._steps)}: {what}")
+        message = f"{where(self._task, self._index, self._steps)}: {what}"
+        return Failure(self._index, kind, message, certain=self._envs is None)
 
 
 Worker = InProcess | OwnProcess
@@ -182,11 +187,3 @@ def _only(observation: Any) -> dict[str, np.ndarray]:
 
 def _left(deadline: float) -> float:
     return max(deadline - time.monotonic(), 0.0)
-
-
-def _start_method() -> str:
-    """Workers must not be forks of this process: a backend has threads in it."""
-    if sys.platform == "win32":
-        return "spawn"
-    multiprocessing.set_forkserver_preload(["train.worker_threads", "train.envs"])  # In this order.
-    return "forkserver"
