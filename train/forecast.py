@@ -35,7 +35,8 @@ def say_memory(options: Options, spaces: Spaces, parameters: int, say: Callable[
         remedy = "a smaller --size" if state > mapped else "a smaller --replay-memory"
         say(f"WARNING: that is more than the {size(memory)} of memory that this machine gives; choose {remedy}")
     there = sum(file.stat().st_size for file in (options.logdir / "replay").glob("chunk-*"))
-    free = shutil.disk_usage(options.logdir).free
+    place = options.logdir.absolute()  # It need not be there yet.
+    free = shutil.disk_usage(next(folder for folder in (place, *place.parents) if folder.exists())).free
     if disk > there + free:
         say(f"WARNING: {options.logdir} has {size(free)} left; choose another --logdir or a smaller --replay-capacity")
 

@@ -51,7 +51,8 @@ def try_out(make: Make, tell: Tell, task: str = "", seed: int | None = None, tim
         with _process(make, task, seed, timeout) as receive:
             made = receive("when it was made")
             if not isinstance(made, Failure):
-                return Trial(*made, seed is None or _deserves_process(receive, tell))
+                known_task, spaces, frame_skip = made
+                return Trial(known_task, spaces, frame_skip, seed is None or _deserves_process(receive, tell))
         attempts += 1
         _require_another(made, attempts, tell)
 
