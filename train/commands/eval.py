@@ -5,7 +5,7 @@ import functools
 import json
 import math
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 
@@ -15,13 +15,14 @@ from reference_numpy.training_loop import derive_seed
 from train.backend import Learner
 from train.checkpoint import open_checkpoint
 from train.cli import Parser
-from train.envs import Environments, Record, is_slow, make_env
+from train.envs import ContractEnv, Environments, Record, is_slow, make_env
 from train.errors import UserError, writing
 from train.evaluation import Agent, Episode, play_episodes, report_failures
 from train.logger import Display
 from train.options import Options
 from train.saved_agent import SavedAgent, agent_of
 from train.setup import import_learner, make_learner
+from train.video import Film
 
 BACKENDS = ("jax", "torch")
 DESCRIPTION = """Play episodes with the agent of a checkpoint. It samples its actions, as in training.
@@ -51,9 +52,13 @@ def main(arguments: Sequence[str]) -> int:
         image_size=saved.info["image_size"],
     )
     learner_type = import_learner(options.backend)
-    make = functools.partial(make_env, options.task, image_size=options.image_size, action_repeat=options.action_repeat)
+    film = Film(values.video) if values.video else None
+    make: Callable[[int], ContractEnv] = functools.partial(
+        make_env, options.task, image_size=options.image_size, action_repeat=options.action_repeat, render=film is not None
+    )
+    make = film.filming(make) if film else make
     count = min(saved.config.envs, values.episodes)
-    with closing(Environments(make, count, count > 1 and is_slow(make, options.seed))) as envs:
+    with closing(Environments(make, count, count > 1 and film is None and is_slow(make, options.seed))) as envs:
         if envs.spaces != saved.spaces:
             raise UserError(f"the task {options.task} has the spaces {envs.spaces}; the agent of {checkpoint.path} has {saved.spaces}")
         learner = make_learner(learner_type, options, saved.spaces)
@@ -67,6 +72,8 @@ def main(arguments: Sequence[str]) -> int:
     where = f"{options.backend} on {learner.device}"
     print(f"{checkpoint.path}: {options.task}, step {saved.info['step']:,}; {len(episodes)} episodes with {where}, seed {values.seed}")
     print(sentence(summary))
+    if film:
+        print(film.save())
     if values.json:
         run = {"checkpoint": str(checkpoint.path), "task": options.task, "step": saved.info["step"], "trained_by": saved.info["backend"]}
         run |= {"backend": options.backend, "device": learner.device, "seed": values.seed}
@@ -135,6 +142,7 @@ def _parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument(
         "--task", metavar="SUITE:NAME", help="play this task instead; needed where the checkpoint names a module, whose code would run"
     )
+    parser.add_argument("--video", type=Path, metavar="FILE", help="a film of the first episode of environment 0: FILE.gif or FILE.mp4")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the summary and every return and length")
     values = parser.parse_args(arguments)
     if values.episodes < 1 or values.seed < 0:
