@@ -16,6 +16,8 @@ DEFAULT_PRESET = "cartpole"
 RESUME = ("auto", "never", "must")
 PROCESSES = ("auto", "yes", "no")
 NONFINITE = ("stop", "skip")
+TRAIN_WHEN = ("always", "between-episodes")
+EVAL_ENV = ("own", "shared")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,6 +49,8 @@ class Options:
     env_failures: int = 10
     restore_envs: bool = True
     info_metrics: str | None = None
+    train_when: str = "always"
+    eval_env: str = "own"
     keep_checkpoints: int = 2
     nonfinite: str = "stop"
     wandb: str | None = None

@@ -69,7 +69,7 @@ def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -
     used = _threads(options, envs.spaces)
     display.say(
         f"{options.task}: {options.backend} on {run.learner.device}, {used} {'thread' if used == 1 else 'threads'}, "
-        f"{parameters:,} parameters, {envs.count} environments, seed {options.seed}; logs in {options.logdir}"
+        f"{parameters:,} parameters, {envs.count} {'environment' if envs.count == 1 else 'environments'}, seed {options.seed}; logs in {options.logdir}"
     )
     if saved:
         resume.restore(run, saved, exactly=record is not None)
@@ -113,8 +113,12 @@ def _hold_logdir(options: Options, stack: ExitStack) -> None:
 
 
 def _require_trainable(options: Options) -> None:
-    """[LOOP-13]: with fewer items than a batch has time steps, training would never start."""
+    """[LOOP-13]: with fewer items than a batch has time steps, training would never start. [LOOP-65], [LOOP-66]: one environment."""
     config = options.config
+    for option, usual in (("train_when", "always"), ("eval_env", "own")):
+        if getattr(options, option) != usual and config.envs != 1:
+            name = f"--{option.replace('_', '-')} {getattr(options, option)}"
+            raise UserError(f"{name} is for a single environment, and this run has {config.envs}; add --envs 1")
     if config.replay_capacity < config.batch_size * config.batch_length:
         raise UserError(
             f"hyperparameter replay_capacity is {config.replay_capacity}; expected at least batch_size x batch_length = "
@@ -154,6 +158,8 @@ def _make_environments(options: Options, stack: ExitStack) -> tuple[Environments
     if options.processes == "auto" and count > 1:
         processes = is_slow(make, options.seed)
     envs = stack.enter_context(closing(Environments(make, count, processes, options.env_timeout, options.env_failures)))
+    if options.eval_env == "shared":
+        return envs, envs
     tests = min(count, max(options.eval_episodes, options.random_episodes))
     if not tests:
         return envs, None
@@ -247,6 +253,8 @@ def _measure_random_policy(run: Run) -> None:
     if run.options.random_episodes and run.test_envs:
         run.display.phase("a random policy plays")
         returns = play_randomly(run.test_envs, run.options.random_episodes, run.options.seed)
+        if run.shares_environment:
+            run.record = _begin(run.options, run.envs, 0)
         run.random_return = float(np.mean(returns))
         run.logger.write(0, 0.0, {"random/return": run.random_return})
         run.display.say(f"a random policy gets {run.random_return:.4g} (mean of {len(returns)} episodes)")
