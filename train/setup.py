@@ -66,10 +66,9 @@ def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -
         record=_begin(options, envs, starts) if record is None else record,
         carry=agent.initial_carry(envs.count),
     )
-    used = _threads(options, envs.spaces)
     display.say(
-        f"{options.task}: {options.backend} on {run.learner.device}, {used} {'thread' if used == 1 else 'threads'}, "
-        f"{parameters:,} parameters, {envs.count} {'environment' if envs.count == 1 else 'environments'}, seed {options.seed}; logs in {options.logdir}"
+        f"{options.task}: {options.backend} on {run.learner.device}, {_counted(_threads(options, envs.spaces), 'thread')}, "
+        f"{parameters:,} parameters, {_counted(envs.count, 'environment')}, seed {options.seed}; logs in {options.logdir}"
     )
     if saved:
         resume.restore(run, saved, exactly=record is not None)
@@ -77,6 +76,10 @@ def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -
         _measure_random_policy(run)
     run.counters.starts += record is None
     return run
+
+
+def _counted(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def _progress(options: Options, saved: Checkpoint | None) -> tuple[int, int]:
