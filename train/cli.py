@@ -19,7 +19,19 @@ from spec import built_profiles, hyperparameters, profiles, sizes
 from train.commands import COMMANDS
 from train.errors import UserError
 from train.machine import own_version
-from train.options import DEFAULT_PRESET, NONFINITE, PROCESSES, RESUME, Options, did_you_mean, make_options, of_seeds, presets
+from train.options import (
+    DEFAULT_PRESET,
+    EVAL_ENV,
+    NONFINITE,
+    PROCESSES,
+    RESUME,
+    TRAIN_WHEN,
+    Options,
+    did_you_mean,
+    make_options,
+    of_seeds,
+    presets,
+)
 from train.replay.layout import DETER_DTYPES
 from train.signals import stoppable
 
@@ -238,6 +250,16 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         type=_whole(0),
         metavar="N",
         help=f"environment steps between evaluations; 0: at the end only (default {base['eval_every']:,})",
+    )
+    schedule.add_argument(
+        "--eval-env",
+        choices=EVAL_ENV,
+        help="shared: evaluations are played in the single environment of training, when its episode has ended (default own)",
+    )
+    schedule.add_argument(
+        "--train-when",
+        choices=TRAIN_WHEN,
+        help="between-episodes: train steps that become due wait until the episode of the single environment has ended (default always)",
     )
     schedule.add_argument("--eval-episodes", type=_whole(0), metavar="N", help="episodes of an evaluation; 0: none (default 10)")
     schedule.add_argument("--random-episodes", type=_whole(0), metavar="N", help="episodes that measure a random policy first (default 10)")

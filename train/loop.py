@@ -13,7 +13,7 @@ from train.envs import Record
 from train.evaluation import report_failures
 from train.finite import finite_action, settle
 from train.options import Options
-from train.schedule import Schedule, finish, log_episode
+from train.schedule import Schedule, evaluation_is_due, finish, log_episode
 from train.setup import prepare
 from train.signals import Stopped, stoppable
 from train.state import Run, TrainStep
@@ -42,12 +42,21 @@ def train(run: Run) -> bool:
     with stoppable() as signals, signals.polled():
         run.interrupted = signals.received
         schedule = Schedule(run)
-        schedule.evaluate(run)
-        while run.step < run.options.steps and not run.interrupted:
-            act(run)
+        if not run.shares_environment:
+            schedule.evaluate(run)
+        while (run.step < run.options.steps or run.counters.due) and not run.interrupted:
+            if run.counters.due and (run.record["is_last"].all() or run.step >= run.options.steps):  # [LOOP-65]
+                learn(run)
+                schedule.attend(run)
+                schedule.save(run)
+                continue
+            lent = run.shares_environment and bool(run.record["is_last"].all()) and evaluation_is_due(run)  # [LOOP-66]
+            act(run, wait=lent)
             schedule.attend(run)
+            if lent:
+                schedule.evaluate(run)
             with run.clock.part("environments"):
-                run.record = run.envs.finish()
+                run.record = run.envs.next_episodes() if lent else run.envs.finish()
             report_failures(run.envs, run.display.say)
             schedule.save(run)
         if run.interrupted:
@@ -56,8 +65,8 @@ def train(run: Run) -> bool:
     return not run.interrupted
 
 
-def act(run: Run) -> None:
-    """One step of the policy in all environments, which then step on while the learner trains."""
+def act(run: Run, wait: bool = False) -> None:
+    """One step of the policy in all environments, which then step on while the learner trains; or wait, where their episodes have ended."""
     record = run.record
     observation = {key: record[key] for key in run.envs.spaces.observations}
     with run.clock.part("policy"):
@@ -65,15 +74,16 @@ def act(run: Run) -> None:
         action, latents, run.carry = run.learner.policy(observation, record["is_first"], run.carry, seed)
     run.counters.policy_steps += 1
     action = finite_action(run, action)
-    with run.clock.part("environments"):
-        run.envs.start(action)
+    if not wait:
+        with run.clock.part("environments"):
+            run.envs.start(action)
     remember_and_learn(run, record, action, {name: np.asarray(value) for name, value in latents.items()})
     for worker, score, length in run.scores.update(record):
         log_episode(run, score, length, run.envs.info[worker])
 
 
 def remember_and_learn(run: Run, record: Record, action: np.ndarray, latents: Mapping[str, np.ndarray]) -> None:
-    """Adds the workers' records one by one, and after each one trains as often as the replay ratio says: [LOOP-4]."""
+    """Adds the workers' records one by one, and after each one trains as often as the replay ratio says: [LOOP-4], or later: [LOOP-65]."""
     with run.clock.part("replay"):
         action = np.where(record["is_last"][:, None], np.float32(0), action)  # [LOOP-9]: nothing can be done at an end.
         packed = run.replay.pack({**record, "action": action, **latents})
@@ -81,8 +91,9 @@ def remember_and_learn(run: Run, record: Record, action: np.ndarray, latents: Ma
             run.replay.add_packed(packed, worker, worker)
             run.counters.records += 1
             if can_train(len(run.replay), run.options.config):
-                for _ in range(run.ratio(run.counters.records)):
-                    learn(run)
+                run.counters.due += run.ratio(run.counters.records)
+            while run.counters.due and run.options.train_when == "always":
+                learn(run)
 
 
 def learn(run: Run) -> None:
@@ -102,4 +113,5 @@ def learn(run: Run) -> None:
         run.replay.write_back(ids, latents, lambda: run.clock.computed(called), metrics["skipped"])
         settle(run)
     run.counters.train_steps += 1
+    run.counters.due -= 1
     run.unsettled = TrainStep(number, seed, batch, metrics)

@@ -18,6 +18,8 @@ RESUME = ("auto", "never", "must")
 PROCESSES = ("auto", "yes", "no")
 NONFINITE = ("stop", "skip")
 CHANGEABLE_GROUPS = ("world_model", "behavior", "optimizer")  # of spec/hyperparameters.toml: [LOOP-70]
+TRAIN_WHEN = ("always", "between-episodes")
+EVAL_ENV = ("own", "shared")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,6 +52,8 @@ class Options:
     env_failures: int = 10
     restore_envs: bool = True
     info_metrics: str | None = None
+    train_when: str = "always"
+    eval_env: str = "own"
     keep_checkpoints: int = 2
     nonfinite: str = "stop"
     wandb: str | None = None

@@ -1,5 +1,6 @@
 """What happens beside learning: metrics, evaluations and checkpoints while a run goes on, and its last words."""
 
+import contextlib
 import dataclasses
 import math
 import os
@@ -40,12 +41,13 @@ class Schedule:
         if now - self._logged_at >= run.options.log_every:
             with run.clock.part("log"):
                 self._log(run, now)
-        self.evaluate(run)
+        if not run.shares_environment:
+            self.evaluate(run)
         self._forecast.attend(run)
 
     def evaluate(self, run: Run) -> None:
         """Plays an evaluation if one is due. To be called before the first step too: a resumed run may have been interrupted in one."""
-        if _evaluation_is_due(run) and not run.interrupted:
+        if evaluation_is_due(run) and not run.interrupted:
             with run.clock.part("evaluation"):
                 run_evaluation(run)
 
@@ -107,7 +109,7 @@ def _facts(run: Run, steps: float, train_steps: float) -> Iterator[str]:
     yield f"{train_steps:.1f} train steps/s"
 
 
-def _evaluation_is_due(run: Run) -> bool:
+def evaluation_is_due(run: Run) -> bool:
     """Whether a multiple of --eval-every has been reached since the last evaluation; at the end `finish` evaluates."""
     every, last = run.options.eval_every, run.evaluation["step"] if run.evaluation else 0
     return every > 0 and run.step // every > last // every and run.step < run.options.steps
@@ -141,7 +143,8 @@ def run_evaluation(run: Run) -> bool:
         return action
 
     try:
-        episodes = evaluate(act, run.test_envs, options.eval_episodes, options.seed, counters.evaluations, run.interrupted)
+        with run.envs.lend() if run.shares_environment else contextlib.nullcontext():
+            episodes = evaluate(act, run.test_envs, options.eval_episodes, options.seed, counters.evaluations, run.interrupted)
     except Interrupted:
         return False
     finally:

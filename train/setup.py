@@ -88,10 +88,9 @@ def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -
         record=_begin(options, envs, starts) if record is None else record,
         carry=agent.initial_carry(envs.count),
     )
-    used = _threads(options, envs.spaces)
     display.say(
-        f"{options.task}: {options.backend} on {run.learner.device}, {used} {'thread' if used == 1 else 'threads'}, "
-        f"{parameters:,} parameters, {envs.count} environments, seed {options.seed}; logs in {options.logdir}"
+        f"{options.task}: {options.backend} on {run.learner.device}, {_counted(_threads(options, envs.spaces), 'thread')}, "
+        f"{parameters:,} parameters, {_counted(envs.count, 'environment')}, seed {options.seed}; logs in {options.logdir}"
     )
     if changed:
         display.say(f"changed from here on: {'; '.join(f'{name} {before} -> {now}' for name, (before, now) in changed.items())}")
@@ -106,6 +105,10 @@ def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -
     run.counters.starts += record is None
     say_outlook(run)
     return run
+
+
+def _counted(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def _progress(options: Options, saved: Checkpoint | None) -> tuple[int, int]:
@@ -153,8 +156,12 @@ def _hold_logdir(options: Options, stack: ExitStack) -> None:
 
 
 def _require_trainable(options: Options) -> None:
-    """[LOOP-13]: with fewer items than a batch has time steps, training would never start."""
+    """[LOOP-13]: with fewer items than a batch has time steps, training would never start. [LOOP-65], [LOOP-66]: one environment."""
     config = options.config
+    for option, usual in (("train_when", "always"), ("eval_env", "own")):
+        if getattr(options, option) != usual and config.envs != 1:
+            name = f"--{option.replace('_', '-')} {getattr(options, option)}"
+            raise UserError(f"{name} is for a single environment, and this run has {config.envs}; add --envs 1")
     if config.replay_capacity < config.batch_size * config.batch_length:
         raise UserError(
             f"hyperparameter replay_capacity is {config.replay_capacity}; expected at least batch_size x batch_length = "
@@ -201,8 +208,11 @@ def _make_environments(options: Options, display: Display, stack: ExitStack) -> 
         made = Environments(make, count, processes, options.env_timeout, options.env_failures, trial, options.task)
         return stack.enter_context(closing(made))
 
-    tests = min(options.config.envs, max(options.eval_episodes, options.random_episodes))
-    return several(options.config.envs), several(tests) if tests else None
+    envs = several(options.config.envs)
+    if options.eval_env == "shared":
+        return envs, envs
+    tests = min(envs.count, max(options.eval_episodes, options.random_episodes))
+    return envs, several(tests) if tests else None
 
 
 def _count_parameters(options: Options, spaces: Spaces) -> int:
@@ -292,6 +302,8 @@ def _measure_random_policy(run: Run) -> None:
     if run.options.random_episodes and run.test_envs:
         run.display.phase("a random policy plays")
         returns = play_randomly(run.test_envs, run.options.random_episodes, run.options.seed)
+        if run.shares_environment:
+            run.record = _begin(run.options, run.envs, 0)
         mean = mean_of(returns)
         run.random_return = mean.value
         error = {} if mean.error is None else {"random/return_standard_error": mean.error}

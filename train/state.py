@@ -102,6 +102,11 @@ class Run:
     interrupted: list[int] = dataclasses.field(default_factory=list)
 
     @property
+    def shares_environment(self) -> bool:
+        """Whether evaluations are played in the environment of training: [LOOP-66]."""
+        return self.test_envs is self.envs
+
+    @property
     def step(self) -> int:
         """Environment steps, action repeat included: the unit of --steps, of the logs and of the curve."""
         return self.counters.records * self.options.action_repeat

@@ -5,7 +5,7 @@ import functools
 import json
 import math
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
 from pathlib import Path
 
@@ -15,13 +15,14 @@ from reference_numpy.training_loop import derive_seed
 from train.backend import Learner
 from train.checkpoint import open_checkpoint
 from train.cli import BACKENDS, Parser
-from train.envs import Environments, Record, make_env, try_out
+from train.envs import ContractEnv, Environments, Record, make_env, try_out
 from train.errors import UserError, writing
 from train.evaluation import Agent, Episode, play_episodes, report_failure, report_failures
 from train.logger import Display
 from train.options import Options, names_code
 from train.saved_agent import SavedAgent, agent_of
 from train.setup import import_learner, make_learner
+from train.video import Film
 
 DESCRIPTION = """Play episodes with the agent of a checkpoint. It samples its actions, as in training, unless --mode is given.
 
@@ -50,12 +51,17 @@ def main(arguments: Sequence[str]) -> int:
         image_size=saved.info["image_size"],
     )
     learner_type = import_learner(options.backend)
-    make = functools.partial(make_env, options.task, image_size=options.image_size, action_repeat=options.action_repeat)
+    film = Film(values.video) if values.video else None
+    make: Callable[[int], ContractEnv] = functools.partial(
+        make_env, options.task, image_size=options.image_size, action_repeat=options.action_repeat, render=film is not None
+    )
+    make = film.filming(make) if film else make
     count = min(saved.config.envs, values.episodes)
     with ExitStack() as stack:
         display = stack.enter_context(Display(values.episodes))
         trial = try_out(make, lambda failure: report_failure(failure, display.say), options.task, options.seed, options.env_timeout)
-        envs = Environments(make, count, trial.deserves_process, options.env_timeout, options.env_failures, trial, options.task)
+        processes = trial.deserves_process and film is None
+        envs = Environments(make, count, processes, options.env_timeout, options.env_failures, trial, options.task)
         stack.enter_context(closing(envs))
         if envs.spaces != saved.spaces:
             raise UserError(f"the task {options.task} has the spaces {envs.spaces}; the agent of {checkpoint.path} has {saved.spaces}")
@@ -69,6 +75,8 @@ def main(arguments: Sequence[str]) -> int:
     where = f"{options.backend} on {learner.device}{', by the mode' if values.mode else ''}"
     print(f"{checkpoint.path}: {options.task}, step {saved.info['step']:,}; {len(episodes)} episodes with {where}, seed {values.seed}")
     print(sentence(summary))
+    if film:
+        print(film.save())
     if values.json:
         run = {"checkpoint": str(checkpoint.path), "task": options.task, "step": saved.info["step"], "trained_by": saved.info["backend"]}
         run |= {"backend": options.backend, "device": learner.device, "seed": values.seed, "mode": values.mode}
@@ -142,6 +150,7 @@ def _parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument(
         "--mode", action="store_true", help="the most probable action instead of a sample; latents are sampled all the same"
     )
+    parser.add_argument("--video", type=Path, metavar="FILE", help="a film of the first episode of environment 0: FILE.gif or FILE.mp4")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the summary and every return and length")
     values = parser.parse_args(arguments)
     if values.episodes < 1 or values.seed < 0:

@@ -60,6 +60,7 @@ class ContractEnv(gymnasium.Env[Observation, np.ndarray]):
         self.spaces: Spaces = self._translation.spaces
         self.frame_skip = frame_skip(env)
         self.metadata = {}
+        self.render_mode = env.render_mode
         self.observation_space, self.action_space = array_spaces(self.spaces)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
@@ -95,6 +96,15 @@ class ContractEnv(gymnasium.Env[Observation, np.ndarray]):
             raise self._garbage(f"the rewards of {self._action_repeat} repeated actions add up to {total}, more than float32 can hold")
         extra = {"metrics": self._metrics(info)} if self._info_metrics and (terminated or truncated) else {}
         return self._observation(observation), total, terminated, truncated, extra
+
+    def render(self) -> Any:
+        """What the environment shows, in its `render_mode`."""
+        return self._env.render()
+
+    def frames_per_second(self, usual: float) -> float:
+        """How many steps of this adapter are a second of the environment's time; `usual` where the environment does not say."""
+        fps = self._env.metadata.get("render_fps") or usual
+        return float(fps) / self._action_repeat
 
     def close(self) -> None:
         self._env.close()

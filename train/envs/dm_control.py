@@ -42,8 +42,11 @@ def make(task: str, domain: str, name: str, image_size: int | None) -> gymnasium
 class DmControlEnv(gymnasium.Env[Any, np.ndarray]):
     """A task of the suite. A time limit truncates: the suite keeps the discount at 1 there."""
 
+    render_mode = "rgb_array"
+
     def __init__(self, env: Any, image_size: int | None, camera: int) -> None:
         self._env = env
+        self.metadata = {"render_modes": ["rgb_array"], "render_fps": 1 / env.control_timestep()}
         self._image_size = image_size
         self._camera = camera
         if image_size is None:
@@ -68,6 +71,9 @@ class DmControlEnv(gymnasium.Env[Any, np.ndarray]):
         if self._image_size is None:
             return step.observation
         return {"image": self._env.physics.render(self._image_size, self._image_size, camera_id=self._camera)}
+
+    def render(self) -> np.ndarray:
+        return self._env.physics.render(240, 320, camera_id=self._camera)
 
     def close(self) -> None:
         self._env.close()

@@ -6,7 +6,9 @@ dmc_vision:DOMAIN-TASK   the same from 64 x 64 images only
 MODULE:CALLABLE     your own: a function or class that, called without arguments, returns a gymnasium.Env: my_package.my_module:make_env
 """
 
+import contextlib
 import importlib
+import inspect
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -24,8 +26,11 @@ _NAMESPACES = {"ALE": ("ale_py", "atari")}
 _EXTRAS = {"box2d": "box2d", "mujoco": "mujoco", "classic_control": "train"}
 
 
-def make_env(task: str, index: int = 0, image_size: int = 64, action_repeat: int = 1, info_metrics: Sequence[str] = ()) -> ContractEnv:
-    """The environment of a task string, adapted. `index` numbers the instances of a run, for messages. The others: see `ContractEnv`.
+def make_env(
+    task: str, index: int = 0, image_size: int = 64, action_repeat: int = 1, info_metrics: Sequence[str] = (), render: bool = False
+) -> ContractEnv:
+    """The environment of a task string, adapted. `index` numbers the instances of a run, for messages. render: with the render mode
+    "rgb_array", where the environment has one. The others: see `ContractEnv`.
 
     Raises:
       UserError: an unknown task, a package that is not installed (with the pip command), an unsupported space.
@@ -34,15 +39,15 @@ def make_env(task: str, index: int = 0, image_size: int = 64, action_repeat: int
     if not separator or not suite or not name:
         raise UserError(f"unknown task {task!r}; expected {SUITES}")
     if suite == "gym":
-        env = _make_gymnasium(task, name)
+        env = _make_gymnasium(task, name, render)
     elif suite in ("dmc", "dmc_vision"):
-        env = _make_dm_control(task, name, vision=suite == "dmc_vision", image_size=image_size)
+        env = _make_dm_control(task, name, vision=suite == "dmc_vision", image_size=image_size, render=render)
     else:
-        env = _make_own(task, suite, name)
+        env = _make_own(task, suite, name, render)
     return ContractEnv(env, task, index, image_size, action_repeat, info_metrics)
 
 
-def _make_gymnasium(task: str, name: str) -> gymnasium.Env[Any, Any]:
+def _make_gymnasium(task: str, name: str, render: bool) -> gymnasium.Env[Any, Any]:
     namespace = name.split("/")[0]
     if namespace in _NAMESPACES:
         module, extra = _NAMESPACES[namespace]
@@ -50,6 +55,9 @@ def _make_gymnasium(task: str, name: str) -> gymnasium.Env[Any, Any]:
     if ":" in name:
         _import_own(task, name.split(":")[0])
     try:
+        if render:
+            with contextlib.suppress(TypeError):  # It takes no render_mode.
+                return gymnasium.make(name, disable_env_checker=True, render_mode="rgb_array")
         return gymnasium.make(name, disable_env_checker=True)
     except gymnasium.error.DependencyNotInstalled as error:
         raise UserError(f"task {task} needs another package: {_gymnasium_extra(name) or error}") from error
@@ -66,9 +74,9 @@ def _gymnasium_extra(name: str) -> str:
     return next((_pip(extra) for folder, extra in _EXTRAS.items() if f"gymnasium.envs.{folder}" in entry_point), "")
 
 
-def _make_dm_control(task: str, name: str, vision: bool, image_size: int) -> gymnasium.Env[Any, Any]:
+def _make_dm_control(task: str, name: str, vision: bool, image_size: int, render: bool) -> gymnasium.Env[Any, Any]:
     adapter = _import("train.envs.dm_control", "dm-control", task)
-    adapter.choose_renderer(vision)
+    adapter.choose_renderer(vision or render)
     try:
         _import("dm_control.suite", "dm-control", task)
     except (ImportError, AttributeError, RuntimeError) as error:  # What a missing graphics library looks like.
@@ -80,12 +88,12 @@ def _make_dm_control(task: str, name: str, vision: bool, image_size: int) -> gym
     return adapter.make(task, domain, control_task, image_size if vision else None)
 
 
-def _make_own(task: str, module_name: str, name: str) -> gymnasium.Env[Any, Any]:
+def _make_own(task: str, module_name: str, name: str, render: bool) -> gymnasium.Env[Any, Any]:
     module = _import_own(task, module_name)
     function = getattr(module, name, None)
     if not callable(function):
         raise UserError(f"unknown task {task!r}: the module {module_name!r} has no function or class {name!r}")
-    env = function()
+    env = function(render_mode="rgb_array") if render and "render_mode" in inspect.signature(function).parameters else function()
     if not isinstance(env, gymnasium.Env):
         raise UserError(f"task {task}: {name}() returned a {type(env).__name__}; expected a gymnasium.Env")
     return env

@@ -1,8 +1,10 @@
 """N environments side by side, each a stream of records as in spec/00-notation.md, and each restarted when it fails."""
 
 import collections
+import contextlib
+import dataclasses
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -126,6 +128,23 @@ class Environments:
         for failure in failures:
             self._end(failure)
         return None if failures else self._record(steps)
+
+    @contextlib.contextmanager
+    def lend(self) -> Iterator[None]:
+        """Inside, other episodes may be played. Afterwards `histories` says what it said before, and `next_episodes` must be called."""
+        self._settle()
+        episodes, action = dict(self._episodes), self._action
+        try:
+            yield
+        finally:
+            self._settle()
+            self._episodes, self._action = episodes, action
+
+    def next_episodes(self) -> Record:
+        """The first records [N, ...] of the episodes that follow those whose last records were given, as `finish` would give them."""
+        for worker, episode in self._episodes.items():
+            self._begin(worker, dataclasses.replace(self._fresh(episode.seed), episode=episode.number + 1))
+        return self._record(self._receive())
 
     def take_failures(self) -> list[Failure]:
         """The failures since the last call."""
