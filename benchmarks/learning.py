@@ -22,7 +22,7 @@ from matplotlib.ticker import EngFormatter, FormatStrFormatter
 
 from benchmarks.machine import command
 from train.curve import BLUE, GRAY, ORANGE
-from train.logger import read_metrics
+from train.logger import iterate_metrics
 from train.machine import describe
 
 COLORS = {"jax": BLUE, "torch": ORANGE}
@@ -55,7 +55,7 @@ def points(logdir: Path, metrics: list[str]) -> dict[str, Any]:
 
     Evaluations are all there; episodes and metrics are means over equal stretches of the run.
     """
-    lines = read_metrics(logdir / "metrics.jsonl")
+    lines = [line for line in iterate_metrics(logdir / "metrics.jsonl") if line]
     curves = {EVALUATION: column(lines, EVALUATION), **{name: means(column(lines, name)) for name in (EPISODES, *metrics)}}
     rounded = {
         name: [[int(step), round(minutes, 2), float(f"{value:.4g}")] for step, minutes, value in curve] for name, curve in curves.items()

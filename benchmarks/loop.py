@@ -19,7 +19,7 @@ import numpy as np
 from gymnasium import spaces as gym
 
 from benchmarks.machine import command
-from train.logger import read_metrics
+from train.logger import iterate_metrics
 from train.machine import describe
 
 EPISODE = 200
@@ -67,7 +67,7 @@ def train(backend: str, task: str, folder: Path, *options: str) -> list[dict[str
     result = subprocess.run([*call, *quiet, *options], capture_output=True, text=True, check=False)
     if result.returncode:
         raise RuntimeError(result.stderr.strip().splitlines()[-1])
-    return [line for line in read_metrics(folder / "metrics.jsonl") if "speed/learner_share" in line]
+    return [line for line in iterate_metrics(folder / "metrics.jsonl") if line and "speed/learner_share" in line]
 
 
 def measure_share(backend: str, task: str, size: str, steps: int) -> dict[str, Any]:

@@ -214,6 +214,9 @@ def test_checkpoints(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     ):
         assert words in out, words
     assert "is a checkpoint; --rerun needs an incident" in refused(capsys, path, "--rerun")
+    healthy = printed(capsys, tmp_path)
+    assert healthy == f"{tmp_path}: no train step has met a number that is not finite. The newest checkpoint: {out}"
+    assert f"{tmp_path} holds no incident" in refused(capsys, tmp_path, "--rerun")
     (path / "learner.safetensors").write_bytes(b"x" * 20)
     assert f"the checkpoint {path} is damaged: " in refused(capsys, path)
     (path / "run.json").unlink()
@@ -225,7 +228,7 @@ def test_what_is_neither(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert f"{tmp_path} holds no incident" in refused(capsys, tmp_path)
     (tmp_path / "nonfinite" / "000000000001").mkdir(parents=True)
     assert "is damaged: " in refused(capsys, tmp_path)
-    assert "unrecognized arguments: --nothing" in refused(capsys, tmp_path, "--nothing")
+    assert "unknown option --nothing" in refused(capsys, tmp_path, "--nothing")
     assert "required: PATH" in refused(capsys)
 
 

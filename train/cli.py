@@ -72,11 +72,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 130
 
 
-def say_error(error: UserError) -> None:
+def say_error(error: UserError, where: str = "") -> None:
     """The one line of a mistake that the user can mend, on stderr."""
     if error.details:
         print(error.details.rstrip(), file=sys.stderr)
-    print(f"train: error: {' '.join(str(error).split())}", file=sys.stderr)
+    print(f"train: error: {where}{' '.join(str(error).split())}", file=sys.stderr)
 
 
 def _run(arguments: Sequence[str]) -> int:

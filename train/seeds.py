@@ -1,10 +1,10 @@
 """`train --seeds 0-4`: runs that differ in their seed alone, one after the other, each in a log directory of its own. [LOOP-73]"""
 
-import sys
 import traceback
 from collections.abc import Callable, Sequence
 
 from train.about import read_about
+from train.cli import say_error
 from train.errors import UserError
 from train.options import Options
 from train.outcome import last_words, read_outcome, summary
@@ -29,7 +29,7 @@ def run_all(runs: Sequence[Options], run: Callable[[Options], bool], say: Callab
         except UserError as error:
             if number == 0 and read_about(options.logdir) is None:
                 raise
-            print(f"{error.details.rstrip()}\ntrain: error: seed {options.seed}: {' '.join(str(error).split())}".strip(), file=sys.stderr)
+            say_error(error, f"seed {options.seed}: ")
             failed.append(options)
             continue
         except Exception:  # Not ours to know; the other seeds are not to be lost by it.

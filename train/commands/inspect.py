@@ -13,14 +13,14 @@ from rich.table import Table
 
 from spec import Spaces, hyperparameters, load_config, parameter_table
 from train.backend import learner_class
-from train.checkpoint import Checkpoint, open_checkpoint
+from train.checkpoint import Checkpoint, candidates, open_checkpoint
 from train.cli import Parser
 from train.errors import UserError
 from train.nonfinite import Incident, Tally, load_incident, newest_incident, nonfinite, offending, tally
 
 DESCRIPTION = """Show what a train step met whose loss or gradient was not finite, or what a checkpoint holds.
 
-  train inspect LOGDIR                            the last incident of a run
+  train inspect LOGDIR                            the last incident of a run, or its newest checkpoint if it has none
   train inspect LOGDIR/nonfinite/000000000123     one incident, by its train step
   train inspect LOGDIR/checkpoints/000000004000   the tensors of a checkpoint"""
 
@@ -44,6 +44,10 @@ def main(arguments: Sequence[str]) -> int:
     if path.parent.name == "checkpoints" or (path / "loop.safetensors").exists():  # A log directory has a run.json too.
         if options.rerun:
             raise UserError(f"{path} is a checkpoint; --rerun needs an incident, which has a batch")
+        _show_checkpoint(console, open_checkpoint(path))
+        return 0
+    if not options.rerun and newest_incident(path) is None and candidates(path):
+        console.print(f"{path}: no train step has met a number that is not finite. The newest checkpoint:", soft_wrap=True)
         _show_checkpoint(console, open_checkpoint(path))
         return 0
     incident = load_incident(_find_incident(path))
