@@ -27,7 +27,12 @@ from conformance.serve import PROTOCOL, BadMessage, decode, encode, to_numpy
 
 RESTARTS = 5
 BABBLE_LINES = 100
-MESSAGE_BYTES = 2**28
+MESSAGE_BYTES = 2**26
+VALUES = 200_000  # numbers, texts, lists, maps and arrays in one result
+FUNCTIONS = 5000  # that a process may offer: a module with all of its imports has some hundreds
+NAME = 200  # characters of a name
+TEXT = 20_000  # characters of an error that are kept: a long traceback
+IN_ALL = 100  # times the timeout: what the replies of all checks may take together, repetitions for smaller cases included
 STDERR_LINES = 10
 RAISED = {"ValueError": ValueError, "KeyError": KeyError, "NotImplementedError": NotImplementedError}
 """Errors that the requirements ask for, and what is not implemented; others are a `CandidateError`."""
@@ -172,6 +177,7 @@ class ProcessAdapter(ForeignAdapter):
         self._timeout = timeout
         self._requests = 0
         self._starts = 0
+        self._waited = 0.0
         self._connection: Connection | None = None
         self._babble = 0
         try:
@@ -191,14 +197,21 @@ class ProcessAdapter(ForeignAdapter):
     def call(self, name: str, arguments: tuple[Any, ...]) -> Any:
         """Raises what the implementation raised, or `CandidateLost`."""
         result = self._ask("run", function=name, args=[encode_argument(argument) for argument in arguments])
+        began = time.monotonic()
         try:
+            _require_plain(result)
             return to_numpy(decode(result))
-        except (BadMessage, TypeError, RecursionError) as error:
-            raise CandidateError(f"{name}: {error}") from error
+        except (BadMessage, TypeError, ValueError, OverflowError, RecursionError) as error:  # a ValueError here refuses no argument
+            raise CandidateError(f"{name}: {_shortened(str(error))}") from error
+        finally:
+            self._waited += time.monotonic() - began
 
     def edition(self) -> str | None:
         try:
-            return as_edition(self._ask("edition"))
+            edition = as_edition(self._ask("edition"))
+            if edition is not None and len(edition) > NAME:
+                raise UserError(f"edition: expected a name, got {len(edition):,} characters")
+            return edition
         except (CandidateLost, CandidateError, ValueError, KeyError) as error:
             raise UserError(f"edition: {_in_one_line(error)}") from error
 
@@ -237,7 +250,13 @@ class ProcessAdapter(ForeignAdapter):
     def _ask(self, method: str, **content: Any) -> Any:
         if self._connection is None:
             self._start()
-        return self._exchange(method, content)
+        if self._waited > IN_ALL * self._timeout:
+            raise CandidateLost(f"its replies have taken more than {IN_ALL * self._timeout:g} s in all, {IN_ALL} times --timeout")
+        began = time.monotonic()
+        try:
+            return self._exchange(method, content)
+        finally:
+            self._waited += time.monotonic() - began
 
     def _exchange(self, method: str, content: Mapping[str, Any]) -> Any:
         """Sends a request and returns the result of its reply."""
@@ -248,16 +267,17 @@ class ProcessAdapter(ForeignAdapter):
         self._connection.send({"id": self._requests, "method": method, **content})
         reply = self._reply(what, deadline)
         if reply.get("id") != self._requests:
-            raise self._lost(what, f"answered request {reply.get('id')!r} where {self._requests} was asked")
+            raise self._lost(what, f"answered request {reply.get('id')!r:.80} where {self._requests} was asked")
         if reply.keys() == {"id", "result"}:
             return reply["result"]
         error = reply.get("error")
-        if reply.keys() != {"id", "error"} or not isinstance(error, dict) or not isinstance(error.get("message"), str):
-            raise self._lost(what, f"a reply needs either a result or an error with kind and message, got the keys {sorted(reply)}")
-        kind = error.get("kind")
-        if kind in RAISED:
-            raise RAISED[kind](error["message"])
-        raise CandidateError(f"{kind}: {error['message']}")
+        match error:
+            case {"kind": str(kind), "message": str(message)} if reply.keys() == {"id", "error"}:
+                if kind in RAISED:
+                    raise RAISED[kind](_shortened(message))
+                raise CandidateError(f"{kind:.{NAME}}: {_shortened(message)}")
+        keys = f"{sorted(reply)!s:.{NAME}}"
+        raise self._lost(what, f"a reply needs either a result or an error with kind and message as text, got the keys {keys}")
 
     def _reply(self, what: str, deadline: float) -> dict[str, Any]:
         """The next line that is a message. Others are shown and left out, up to BABBLE_LINES of one process."""
@@ -299,6 +319,26 @@ class ProcessAdapter(ForeignAdapter):
         return CandidateLost("\n".join([f"the process was lost at {what}: {reason}", *shown]))
 
 
+def _shortened(text: str) -> str:
+    return text if len(text) <= TEXT else f"{text[:TEXT]} ... ({len(text):,} characters)"
+
+
+def _require_plain(result: Any) -> None:
+    """Raises:
+    BadMessage: more values than a result may have, or a whole number that no array holds.
+    """
+    left, count = [result], 0
+    while left:
+        value = left.pop()
+        count += 1
+        if isinstance(value, dict | list):
+            left.extend(value.values() if isinstance(value, dict) else value)
+        elif isinstance(value, int) and not -(2**63) <= value < 2**63:
+            raise BadMessage("a whole number of more than 64 bits")
+        if count + len(left) > VALUES:
+            raise BadMessage(f"more than {VALUES:,} values in one result; send arrays as dtype, shape and data")
+
+
 def _in_one_line(error: BaseException) -> str:
     return " | ".join(str(error).splitlines())
 
@@ -309,9 +349,11 @@ def _problem_of_start(started: Any) -> str:
     if started["protocol"] != PROTOCOL:
         return f"it speaks protocol {started['protocol']!r}, and the kit {PROTOCOL}"
     for name in ("name", "version"):
-        if not isinstance(started[name], str):
-            return f"expected the {name} as text, got {started[name]!r:.80}"
+        if not isinstance(started[name], str) or len(started[name]) > NAME:
+            return f"expected the {name} as text of at most {NAME} characters, got {started[name]!r:.80}"
     functions = started["functions"]
     if not isinstance(functions, list) or not all(isinstance(name, str) for name in functions):
         return f"expected the names of the functions as a list of text, got {functions!r:.80}"
+    if len(functions) > FUNCTIONS or any(len(name) > NAME for name in functions):
+        return f"expected at most {FUNCTIONS:,} functions with names of at most {NAME} characters, got {len(functions):,}"
     return ""

@@ -40,7 +40,9 @@ def symlog(x):
 
 def result_of(request):
     if request["method"] == "start":
-        return {"protocol": 1, "name": "fake", "version": "0.1", "functions": ["symlog", "kl_losses", "an_extra"]}
+        functions = [f"f{n}" for n in range(1_000_000)] if MODE == "a million functions" else ["symlog", "kl_losses", "an_extra"]
+        name = "fake" * 10**6 if MODE == "long name" else "fake"
+        return {"protocol": 1, "name": name, "version": "0.1", "functions": functions}
     if request["method"] == "edition":
         return 3 if MODE == "odd edition" else "official"
     if request["method"] == "run":
@@ -54,7 +56,7 @@ def reply_to(request):
     reply = {"id": request["id"], "result": result_of(request)}
     if (MODE in ERRORS and request["method"] == "run") or f"refuses {request['method']}" == MODE:
         reply = {"id": request["id"], "error": {"kind": MODE, "message": "fake refuses x"}}
-    if MODE == "odd edition":
+    if MODE in ("odd edition", "a million functions"):
         return json.dumps(reply)
     VALIDATORS["error_reply" if "error" in reply else f"{request['method']}_reply"].validate(reply)
     return json.dumps(reply)
@@ -95,6 +97,12 @@ def misbehave(reply):
             "too few bytes": reply.replace('"shape": [', '"shape": [7, '),
             "unknown dtype": reply.replace("float64", "float8"),
             "text": reply.partition(",")[0] + ', "result": "fine"}',
+            "a list as kind": reply.partition(",")[0] + ', "error": {"kind": ["ValueError"], "message": "x"}}',
+            "long error": reply.partition(",")[0] + f', "error": {{"kind": "{"k" * LONG}", "message": "{"xyz12" * 2 * LONG}"}}}}',
+            "long refusal": reply.partition(",")[0] + f', "error": {{"kind": "ValueError", "message": "{"x" * LONG}"}}}}',
+            "many values": reply.partition(",")[0] + f', "result": [{"[]," * 300_000}[]]}}',
+            "huge number": reply.partition(",")[0] + f', "result": {10**40}}}',
+            "impossible shape": reply.partition(",")[0] + f', "result": {{"dtype": "float64", "shape": [0, {10**30}], "data": ""}}}}',
             "null": reply.partition(",")[0] + ', "result": null}',
         }.get(MODE, reply)
         + "\n"
@@ -103,6 +111,7 @@ def misbehave(reply):
 
 ERRORS = ("ValueError", "KeyError", "TypeError")
 MODE = sys.argv[1] if len(sys.argv) > 1 else ""
+LONG = 10_000_000 if MODE.startswith("long ") else 1
 
 
 def main():

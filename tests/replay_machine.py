@@ -75,6 +75,7 @@ def death(at: int) -> Iterator[None]:
         mock.patch("os.posix_fallocate", dying(os.posix_fallocate)),
         mock.patch("pathlib.Path.unlink", dying(Path.unlink)),
         mock.patch("pathlib.Path.rename", dying(Path.rename)),
+        mock.patch("os.replace", dying(os.replace)),
     ):
         yield
 
@@ -192,9 +193,19 @@ class ReplayMachine(RuleBasedStateMachine):
         seed=SEEDS,
         copied=st.booleans(),
         again=st.booleans(),
+        saved_again=st.booleans(),
     )
     def crash(
-        self, lives: list[str], which: int, continue_streams: bool, during: str, at: int, seed: int, copied: bool, again: bool
+        self,
+        lives: list[str],
+        which: int,
+        continue_streams: bool,
+        during: str,
+        at: int,
+        seed: int,
+        copied: bool,
+        again: bool,
+        saved_again: bool,
     ) -> None:
         """After some more life the process dies while it does something; one of the saves is restored: the last, if it is not damaged."""
         for number, what in enumerate(["save", *lives] if not self.saves else lives):
@@ -204,7 +215,7 @@ class ReplayMachine(RuleBasedStateMachine):
                 self.add_batch(seed + number, 3 if what == "add" else 1)
                 if what == "train" and len(self.naive):
                     self.train(seed + number, 3)
-        which = min(which, len(self.saves) - 1)
+        which, newest = min(which, len(self.saves) - 1), self.saves[-1][0]
         self.saves = self.saves[: len(self.saves) - which]
         _, description, naive = self.saves[-1]
         directory = self.replay.directory
@@ -221,6 +232,9 @@ class ReplayMachine(RuleBasedStateMachine):
         self.compare_everything()
         if len(self.naive):
             self.sample(seed, 5, True)
+        if which and saved_again:  # As in a run, which makes the same steps again, and saves of the same names.
+            self.saves.append((newest, self.replay.save(newest), copy.deepcopy(self.naive)))
+            self.replay.keep([name for name, _, _ in self.saves])
 
     def die(self, during: str, seed: int, description: dict[str, Any], continue_streams: bool) -> None:
         rng = np.random.default_rng(seed)

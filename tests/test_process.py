@@ -148,6 +148,9 @@ def test_a_lost_process_is_a_result(mode: str, monkeypatch: pytest.MonkeyPatch) 
         ("too few bytes", "bytes, got"),
         ("unknown dtype", "expected one of the dtypes bool, "),
         ("text", "expected numbers, got str"),
+        ("many values", "more than 200,000 values in one result"),
+        ("huge number", "a whole number of more than 64 bits"),
+        ("impossible shape", ""),
         ("null", "expected numbers, got None"),
     ],
 )
@@ -164,6 +167,30 @@ def test_a_result_that_cannot_be_read(mode: str, message: str) -> None:
 def test_errors_of_the_other_side(mode: str, raised: type[Exception]) -> None:
     with fake(mode) as adapter, pytest.raises(raised, match="fake refuses x"):
         adapter.symlog(np.ones(2))
+
+
+@pytest.mark.parametrize(("mode", "raised"), [("long error", CandidateError), ("long refusal", ValueError)])
+def test_a_long_error_is_cut(mode: str, raised: type[Exception]) -> None:
+    with fake(mode) as adapter, pytest.raises(raised) as found:
+        adapter.symlog(np.ones(2))
+    assert len(str(found.value)) < 2 * process.TEXT
+    assert "0,000,000 characters)" in str(found.value)
+
+
+def test_a_kind_that_is_no_text_loses_the_process() -> None:
+    with fake("a list as kind") as adapter, pytest.raises(CandidateLost, match="an error with kind and message as text"):
+        adapter.symlog(np.ones(2))
+
+
+def test_the_whole_conversation_has_a_limit() -> None:
+    """Whatever each reply takes: what comes after the limit is a result too, and at once."""
+    with fake() as adapter:
+        assert result_of(adapter).status == "pass"
+        assert 0 < adapter._waited < process.IN_ALL * adapter._timeout
+        adapter._waited = process.IN_ALL * adapter._timeout + 1
+        result = result_of(adapter)
+        assert result.status == "error"
+        assert result.message == "its replies have taken more than 6000 s in all, 100 times --timeout"
 
 
 def test_babble_is_shown_and_left_out(capfd: pytest.CaptureFixture[str]) -> None:
@@ -228,6 +255,8 @@ def test_an_edition_that_is_none(mode: str, message: str) -> None:
     [
         (command("dies at once"), "ended with exit code 1 | its standard error ended with: | no such licence"),
         (command("old protocol"), "it speaks protocol 0, and the kit 1"),
+        (command("a million functions"), "expected at most 5,000 functions with names of at most 200 characters, got 1,000,000"),
+        (command("long name"), "expected the name as text of at most 200 characters"),
         (command("reads nothing"), "no reply within 0.5 s"),
         (command("refuses start"), "the process was lost at start: refuses start: fake refuses x"),
         ("no-such-program --now", "cannot run 'no-such-program --now'"),

@@ -9,7 +9,6 @@ import pytest
 
 from conformance.preflight import Comparison, Report
 from spec import Discrete, Spaces, Vector, hyperparameters, load_config
-from train import about as module
 from train.about import command_line, nearest, read_about, write_about
 from train.cli import build_parser, parse
 from train.errors import UserError
@@ -98,7 +97,7 @@ def test_run_json_is_complete_or_as_it_was(tmp_path: Path, monkeypatch: pytest.M
     def fail(*_: Any) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(module.os, "fsync", fail)
+    monkeypatch.setattr("os.fsync", fail)
     with pytest.raises(UserError, match=r"cannot write .*run.json: No space left"):
         write(options, 10)
     assert read_about(tmp_path) == first

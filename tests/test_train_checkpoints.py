@@ -228,19 +228,22 @@ def test_what_a_killed_save_left_does_not_stop_the_next_one(make: Make) -> None:
     assert [entry.name for entry in path.parent.iterdir()] == [path.name]
 
 
-@pytest.mark.parametrize("name", ["learner.safetensors", "loop.safetensors", "run.json", "SHA256SUMS", "replay"])
+def spoil(path: Path, damage: str) -> None:
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 4
+    path.write_bytes(content if damage == "a flipped bit" else content[:20])
+    if damage == "missing":
+        path.unlink()
+
+
+@pytest.mark.parametrize("name", ["learner.safetensors", "loop.safetensors", "run.json", "SHA256SUMS"])
 @pytest.mark.parametrize("damage", ["cut off", "a flipped bit", "missing"])
 def test_a_damaged_checkpoint_falls_back_to_the_one_before(make: Make, name: str, damage: str, capsys: pytest.CaptureFixture[str]) -> None:
     whole = run_quietly(make(steps=120, logdir=make().logdir / "whole"))
     loop.run(make(steps=60), FakeLearner)
     loop.run(make(steps=90), FakeLearner)
     newest = make().logdir / "checkpoints" / "000000000090"
-    path = newest / name if name != "replay" else max((make().logdir / "replay").glob("saved-*"))
-    content = bytearray(path.read_bytes())
-    content[len(content) // 2] ^= 4
-    path.write_bytes(content if damage == "a flipped bit" else content[:20])
-    if damage == "missing":
-        path.unlink()
+    spoil(newest / name, damage)
     capsys.readouterr()
     resumed = run_quietly(make(steps=120))
     output = capsys.readouterr().out
@@ -249,6 +252,41 @@ def test_a_damaged_checkpoint_falls_back_to_the_one_before(make: Make, name: str
     assert (newest.parent / "000000000090.damaged").is_dir()
     assert (resumed.counters.records, resumed.counters.train_steps) == (120, whole.counters.train_steps)
     assert sum(len(stream["reward"]) for stream in stored(resumed)) == 120
+
+
+@pytest.mark.covers("LOOP-53")
+@pytest.mark.parametrize("which", ["newest", "all"])
+@pytest.mark.parametrize("damage", ["cut off", "a flipped bit", "missing"])
+def test_a_damaged_buffer_costs_no_checkpoint(make: Make, damage: str, which: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """The newest state of the buffer that can be read is taken, or an empty one; parameters and counters are those of the checkpoint."""
+    loop.run(make(steps=60), FakeLearner)
+    loop.run(make(steps=90), FakeLearner)
+    directory = make().logdir / "replay"
+    states = sorted(directory.glob("saved-*"))
+    for path in states if which == "all" else states[-1:]:
+        spoil(path, damage)
+    files = {path.name: path.read_bytes() for path in directory.iterdir()}
+    trained = checkpoint.open_checkpoint(make().logdir).info["counters"]["train_steps"]
+    capsys.readouterr()
+    with ExitStack() as stack:
+        resumed = setup.prepare(make(steps=120), FakeLearner, stack)
+        loop.train(resumed)
+        loop.finish(resumed)
+        records = sum(len(stream["reward"]) for stream in stored(resumed))
+    output = capsys.readouterr().out
+    assert "continuing at step 90" in output
+    assert str(states[-1]) in next(line for line in output.splitlines() if line.startswith("WARNING"))
+    assert not list((make().logdir / "checkpoints").glob("*.damaged*"))
+    assert resumed.counters.records == 120
+    if which == "newest":
+        assert records == 60 + 30
+        assert resumed.counters.train_steps - trained == 30 * 32 // 6
+    else:
+        assert records == 30
+        assert {path.name: path.read_bytes() for path in (directory / "damaged").iterdir()} == files
+        assert 0 < resumed.counters.train_steps - trained < 30 * 32 // 6, "steps until the buffer is filled again are not paid for"
+    loop.run(make(steps=150), FakeLearner)
+    assert "WARNING" not in capsys.readouterr().out
 
 
 def test_a_run_whose_checkpoints_are_all_damaged_does_not_begin_anew(make: Make) -> None:

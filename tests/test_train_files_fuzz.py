@@ -279,7 +279,7 @@ def outcome(original: Original, expected: SavedAgent, seed: int) -> tuple[str, s
                 if not (folder / "SHA256SUMS").is_file():
                     os.unlink(folder / "SHA256SUMS")
                 seal(folder, original.names)
-            except (OSError, ValueError):
+            except (OSError, ValueError, UserError):
                 forged = False
         try:
             agent = original.load(folder)

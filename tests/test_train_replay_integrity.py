@@ -67,7 +67,7 @@ DAMAGES: dict[str, tuple[Callable[[Path, Replay], None], str]] = {
     "missing": (lambda path, replay: path.unlink(), "is missing"),
     "header": (lambda path, replay: spoil_header(path), "damaged header"),
     "garbage": (lambda path, replay: garbage(path), "damaged header"),
-    "a directory": (lambda path, replay: (path.unlink(), path.mkdir()), "bytes, expected"),
+    "a directory": (lambda path, replay: (path.unlink(), path.mkdir()), "is not a file"),
 }
 
 

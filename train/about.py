@@ -3,7 +3,6 @@
 import dataclasses
 import datetime
 import json
-import os
 import secrets
 import shlex
 from collections.abc import Mapping
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from spec import Config, Spaces, built_profiles, load_config, sizes
 from train.errors import writing
-from train.files import read_json
+from train.files import read_json, replacing
 from train.machine import describe
 from train.options import Options, presets
 
@@ -56,6 +55,7 @@ def write_about(
     known, starts = earlier.get("id"), earlier.get("starts")
     about = {
         "format": FORMAT,
+        "has_checkpoint": resumed_at is not None,
         "id": known if isinstance(known, str) else secrets.token_hex(8),
         "command": shlex.join(command_line(options)),
         "task": options.task,
@@ -73,18 +73,32 @@ def write_about(
         "machine": machine,
         "starts": [*(starts if isinstance(starts, list) else []), start],
     }
-    text = json.dumps(about, indent=1) + "\n"
-    _write(options.logdir / NAME, text)
-    return json.loads(text)
+    return write_json(options.logdir / NAME, about)
 
 
 def read_about(logdir: Path) -> About | None:
-    """What run.json says; None if it is not there, damaged or of another format. No entry can be relied on."""
+    """What run.json says; None if it is not there, damaged or of another format. No entry can be relied on.
+
+    Raises:
+      Unreadable.
+    """
     try:
         about = read_json(logdir / NAME)
-    except (OSError, ValueError):
+    except (FileNotFoundError, ValueError):
         return None
     return about if about.get("format") == FORMAT else None
+
+
+def write_json(path: Path, value: About) -> About:
+    """Writes run.json, complete or not at all, and returns what stands there: ? for the bytes of a path that is not UTF-8.
+
+    Raises:
+      UserError: the disk refuses it.
+    """
+    data = (json.dumps(value, indent=1, ensure_ascii=False) + "\n").encode("utf-8", "replace")
+    with writing(path), replacing(path) as file:
+        file.write(data)
+    return json.loads(data)
 
 
 def command_line(options: Options) -> list[str]:
@@ -128,13 +142,3 @@ def _show(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     return ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
-
-
-def _write(path: Path, text: str) -> None:
-    temporary = path.with_suffix(".tmp")
-    with writing(path):
-        with temporary.open("w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)

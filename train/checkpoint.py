@@ -9,9 +9,12 @@ LOGDIR/checkpoints/<environment step>/
 
 import dataclasses
 import json
+import os
 import re
-import shutil
+import stat
+import time
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -20,32 +23,44 @@ from safetensors import SafetensorError
 from safetensors.numpy import save_file
 
 from train.errors import UserError
-from train.files import SUMS, Arrays, flush, read_arrays, read_json, require_intact, seal
+from train.files import SUMS, Arrays, Sealed, entries, flush, new_folder, open_sealed, reading, remove_folder, require_intact, seal
 from train.options import may_change
 
 FORMAT = 3
-OURS = re.compile(r"\d{12}(\.tmp|\.old)?")  # .tmp: being written; .old: about to be replaced by the same step
+ONCE_COMPLETE = re.compile(r"[0-9]{12}(\.old)?")  # .old: about to be replaced by the same step
+UNFINISHED = re.compile(r"[0-9]{12}(\.old)?\.[0-9a-f]{8}\.tmp")  # being written, or being removed
 FILES = ("learner.safetensors", "loop.safetensors", "run.json")
+ATTEMPTS, PAUSE = 100, 0.01  # to read a checkpoint that a run replaces meanwhile; seconds between two
 
 
 class Damaged(UserError):
-    """A checkpoint whose files are not those that were written."""
+    """A checkpoint whose files were read and are not those that were written."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Checkpoint:
-    """info: format, identity (train.options.Options.identity), backend, spaces, counters, and what else train/resume.py puts there."""
+    """info: format, identity (train.options.Options.identity), backend, spaces, counters, and what else train/resume.py puts there.
+
+    Its files stay open, so that it can be read to the end even if the run removes it meanwhile.
+    """
 
     path: Path
     info: dict[str, Any]
+    sealed: Sealed = dataclasses.field(repr=False)
 
     @property
     def learner(self) -> Arrays:
-        return _read_arrays(self.path / "learner.safetensors")
+        return self._arrays("learner.safetensors")
 
     @property
     def loop(self) -> Arrays:
-        return _read_arrays(self.path / "loop.safetensors")
+        return self._arrays("loop.safetensors")
+
+    def _arrays(self, name: str) -> Arrays:
+        try:
+            return self.sealed.arrays(name)
+        except ValueError as error:
+            raise _damaged(self.path, error) from error
 
 
 def name_of(step: int) -> str:
@@ -56,38 +71,70 @@ def name_of(step: int) -> str:
 def save(logdir: Path, step: int, learner: Mapping[str, Any], loop: Mapping[str, Any], info: Mapping[str, Any], keep: int) -> Path:
     """Writes a checkpoint under another name, renames it, then removes all but the newest `keep`. [LOOP-22]
 
+    What others have put into the folder `checkpoints` or into a checkpoint stays where it is: [LOOP-52].
+
     Raises:
       UserError: the disk refuses it.
     """
     directory = logdir / "checkpoints"
-    final, temporary = directory / name_of(step), directory / f"{name_of(step)}.tmp"
+    final = directory / name_of(step)
     try:
-        shutil.rmtree(temporary, ignore_errors=True)
-        temporary.mkdir(parents=True)
+        temporary = new_folder(final)
         save_file(_contiguous(_single_precision(learner)), temporary / "learner.safetensors")
         save_file(_contiguous(loop), temporary / "loop.safetensors")
         (temporary / "run.json").write_text(json.dumps({"format": FORMAT, **info}, indent=2) + "\n", encoding="utf-8")
         seal(temporary, FILES)
+        old = directory / f"{name_of(step)}.old"
         if final.exists():  # The same step again, as before and after the last evaluation.
-            old = directory / f"{name_of(step)}.old"
             if old.exists():  # A process was killed before it could remove it.
-                shutil.rmtree(old)
+                _discard(old)
             final.rename(old)
         temporary.rename(final)
+        for other in _foreign(old):
+            other.rename(final / other.name)
         flush(directory)
         kept = [path for path in candidates(logdir) if path.suffix == ""][:keep]
-        for other in directory.iterdir():
-            if other not in kept and OURS.fullmatch(other.name):
-                shutil.rmtree(other)
+        for path in entries(directory):
+            if path not in kept and (ONCE_COMPLETE.fullmatch(path.name) or UNFINISHED.fullmatch(path.name)):
+                _discard(path)
     except (OSError, SafetensorError) as error:
         raise UserError(f"cannot write the checkpoint {final}: {error}") from error
     return final
 
 
+def _discard(path: Path) -> None:
+    """Removes a checkpoint if the system lets us and nothing else is in it. It is renamed first: nobody shall find a half of it."""
+    if path.is_symlink() or not path.is_dir() or _foreign(path):
+        return
+    with suppress(OSError):
+        if not UNFINISHED.fullmatch(path.name):
+            aside = new_folder(path)
+            path = path.rename(aside)  # In the place of an empty folder.
+        remove_folder(path, (*FILES, SUMS))
+
+
+def _foreign(path: Path) -> list[Path]:
+    return [entry for entry in entries(path) if entry.name not in (*FILES, SUMS)]
+
+
 def candidates(logdir: Path) -> list[Path]:
-    """The checkpoints of a log directory that were once complete, the newest first."""
-    found = (path for path in (logdir / "checkpoints").glob("*") if OURS.fullmatch(path.name) and path.suffix != ".tmp")
+    """The checkpoints of a log directory that were once complete, the newest first.
+
+    Raises:
+      Unreadable: the folder of the checkpoints, or one of them, cannot be looked into.
+    """
+    found = [path for path in entries(logdir / "checkpoints") if ONCE_COMPLETE.fullmatch(path.name) and _holds_any(path)]
     return sorted(found, key=lambda path: (path.stem, path.suffix == ""), reverse=True)
+
+
+def _holds_any(path: Path) -> bool:
+    """Whether it is a folder with one of our files at least."""
+    try:
+        with reading(path):
+            is_folder = stat.S_ISDIR(os.stat(path).st_mode)
+    except FileNotFoundError:  # It was removed meanwhile.
+        return False
+    return is_folder and any(entry.name in (*FILES, SUMS) for entry in entries(path))
 
 
 def set_aside(checkpoint: Path) -> Path:
@@ -96,9 +143,9 @@ def set_aside(checkpoint: Path) -> Path:
     Raises:
       UserError: the disk refuses it.
     """
-    aside = checkpoint.with_name(f"{checkpoint.name}.damaged")
+    names = (f"{checkpoint.name}.damaged{'' if number == 1 else f'-{number}'}" for number in range(1, 1000))
+    aside = next(path for path in map(checkpoint.with_name, names) if not os.path.lexists(path))
     try:
-        shutil.rmtree(aside, ignore_errors=True)
         return checkpoint.rename(aside)
     except OSError as error:
         raise UserError(f"cannot rename the damaged checkpoint {checkpoint}: {error.strerror}; remove it yourself") from error
@@ -107,23 +154,55 @@ def set_aside(checkpoint: Path) -> Path:
 def open_checkpoint(path: Path) -> Checkpoint:
     """The checkpoint in a folder, or the newest one of a log directory or of its folder `checkpoints`.
 
+    A run may replace it meanwhile: then the one that takes its place is read.
+
     Raises:
       Damaged: a file is missing or not what was written.
+      Unreadable: it cannot be read now.
       UserError: there is none, or it has another format.
     """
-    if not OURS.fullmatch(path.name) and not (path / SUMS).exists():
-        found = candidates(path.parent if path.name == "checkpoints" else path)
-        if not found:
-            raise UserError(f"no checkpoint in {path}; expected a log directory of `train`, or one of the folders in its checkpoints/")
-        path = found[0]
+    is_one = ONCE_COMPLETE.fullmatch(path.name) is not None or os.path.lexists(path / SUMS)
+    for _ in range(ATTEMPTS):
+        found = [path] if is_one else candidates(path.parent if path.name == "checkpoints" else path)
+        before = _identity(found[0]) if found else None
+        try:
+            if before:
+                return _open(found[0])
+        except FileNotFoundError:
+            pass
+        except Damaged:
+            if _identity(found[0]) == before:
+                raise
+        time.sleep(PAUSE)
+    if not is_one and not found:
+        raise UserError(f"no checkpoint in {path}; expected a log directory of `train`, or one of the folders in its checkpoints/")
+    raise UserError(f"the checkpoint {path} is not there" if not before else f"{path} is replaced faster than it can be read; try again")
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    """What tells a folder from one that takes its place; None if there is none."""
     try:
-        info = read_json(path / "run.json")
+        with reading(path):
+            found = os.stat(path)
+    except FileNotFoundError:
+        return None
+    return found.st_dev, found.st_ino
+
+
+def _open(path: Path) -> Checkpoint:
+    try:
+        sealed = open_sealed(path, FILES)
+        info = sealed.json("run.json")
         if info.get("format") != FORMAT:
             raise UserError(f"the checkpoint {path} has format {info.get('format')!r:.80}; this version reads format {FORMAT}")
-        require_intact(path, FILES)
-    except (OSError, ValueError) as error:
-        raise Damaged(f"the checkpoint {path} is damaged: {error!s:.500}") from error
-    return Checkpoint(path, info)
+        require_intact(sealed, FILES)
+    except ValueError as error:
+        raise _damaged(path, error) from error
+    return Checkpoint(path, info, sealed)
+
+
+def _damaged(path: Path, error: Exception) -> Damaged:
+    return Damaged(f"the checkpoint {path} is damaged: {error!s:.500}")
 
 
 def require_same_identity(checkpoint: Checkpoint, given: Mapping[str, Any]) -> None:
@@ -174,11 +253,4 @@ def _single_precision(arrays: Mapping[str, Any]) -> Arrays:
 
 
 def _contiguous(arrays: Mapping[str, Any]) -> Arrays:
-    return {name: np.asarray(array, order="C") for name, array in arrays.items()}
-
-
-def _read_arrays(path: Path) -> Arrays:
-    try:
-        return read_arrays(path)
-    except (OSError, ValueError) as error:
-        raise Damaged(f"the checkpoint {path.parent} is damaged: {error!s:.500}") from error
+    return {name: np.array(array, order="C", copy=None) for name, array in arrays.items()}

@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from PIL import Image
@@ -20,6 +20,7 @@ from tensorboard.summary.writer.event_file_writer import EventFileWriter
 
 from train.about import About
 from train.errors import UserError, writing
+from train.files import open_file, reading
 
 PLAIN_EVERY = 10.0  # seconds between lines where there is no terminal
 
@@ -44,10 +45,12 @@ class Logger:
     def __init__(self, logdir: Path, position: int | None = None, *, wandb: str | None = None, about: About | None = None) -> None:
         self._path = logdir / "metrics.jsonl"
         with writing(self._path):
-            self.warnings = _cut(self._path, position or 0)
-            self._file = self._path.open("ab")
+            self._file = _open_log(self._path)
+            self.warnings = _cut(self._file, self._path, position or 0)
+            last = _last_step(self._file)
+            self._file.seek(0, os.SEEK_END)
         with writing(logdir):
-            self._tensorboard = _TensorBoard(logdir, _last_step(self._path))
+            self._tensorboard = _TensorBoard(logdir, last)
         self._wandb = _Wandb(logdir, wandb, about or {}) if wandb else None
 
     def write(self, step: int, seconds: float, metrics: Mapping[str, float]) -> None:
@@ -90,33 +93,43 @@ class Logger:
                 self._tensorboard.close()
 
 
-def _cut(path: Path, position: int) -> list[str]:
+def _open_log(path: Path) -> BinaryIO:
+    """metrics.jsonl, for reading and writing; made if it is not there.
+
+    Raises:
+      OSError: the disk refuses it.
+      UserError: a link or something else than a file stands there; it is left as it is.
+    """
+    if os.path.lexists(path) and (path.is_symlink() or not path.is_file()):
+        raise UserError(f"{path} is no file of a run, but a {'link' if path.is_symlink() else 'directory or device'}: move it away")
+    flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+    return os.fdopen(os.open(path, flags, 0o666), "rb+")
+
+
+def _cut(file: BinaryIO, path: Path, position: int) -> list[str]:
     """Cuts metrics.jsonl back to so many bytes, and to whole lines if it is not what it was. Returns what is to be said about it."""
-    path.touch()
-    with path.open("rb+") as file:
-        size = file.seek(0, os.SEEK_END)
-        file.truncate(min(size, position))
-    rest = _tail(path).rpartition(b"\n")[2]
+    size = file.seek(0, os.SEEK_END)
+    file.truncate(min(size, position))
+    rest = _tail(file).rpartition(b"\n")[2]
     kept = min(size, position) - len(rest)
     if kept == position:
         return []
-    os.truncate(path, kept)
+    file.truncate(kept)
     return [f"{path} has {size:,} bytes, and {position:,} belong to the checkpoint; {kept:,} bytes of whole lines were kept"]
 
 
-def _last_step(path: Path) -> int | None:
+def _last_step(file: BinaryIO) -> int | None:
     """Of the last line, if there is one."""
-    for text in _tail(path).splitlines()[-1:]:
+    for text in _tail(file).splitlines()[-1:]:
         line = _numbers(text)
         return int(line["step"]) if line else None
     return None
 
 
-def _tail(path: Path) -> bytes:
+def _tail(file: BinaryIO) -> bytes:
     """The end of a file, longer than any line of ours."""
-    with path.open("rb") as file:
-        file.seek(max(0, file.seek(0, os.SEEK_END) - 2**20))
-        return file.read()
+    file.seek(max(0, file.seek(0, os.SEEK_END) - 2**20))
+    return file.read()
 
 
 class _TensorBoard:
@@ -192,10 +205,18 @@ def _png(image: np.ndarray) -> bytes:
 
 
 def iterate_metrics(path: Path) -> Iterator[dict[str, float] | None]:
-    """The lines of a metrics.jsonl one by one: the numbers of each by name, or None for a line that is damaged or cut off."""
-    if path.exists():
-        with path.open("rb") as file:
-            yield from map(_numbers, file)
+    """The lines of a metrics.jsonl one by one: the numbers of each by name, or None for a line that is damaged or cut off.
+
+    Raises:
+      Unreadable.
+      ValueError: something else than a file stands there.
+    """
+    try:
+        file = open_file(path)
+    except FileNotFoundError:
+        return
+    with reading(path), file:
+        yield from map(_numbers, file)
 
 
 def _numbers(text: bytes) -> dict[str, float] | None:

@@ -10,7 +10,7 @@ import dataclasses
 import json
 import math
 import platform
-import shutil
+import re
 from collections.abc import Mapping
 from importlib import metadata
 from pathlib import Path
@@ -22,7 +22,7 @@ from safetensors.numpy import save_file
 
 from train.backend import Learner
 from train.errors import UserError
-from train.files import flush, read_arrays, read_json, require_intact, seal
+from train.files import SUMS, entries, flush, new_folder, open_sealed, remove_folder, require_intact, seal
 
 FORMAT = 1
 FILES = ("learner.safetensors", "batch.safetensors", "incident.json")
@@ -118,16 +118,14 @@ def save_incident(directory: Path, learner: Learner, batch: Arrays, seed: int, i
         "tensors": [dataclasses.asdict(one) for one in tallies],
     }
     final = directory / "nonfinite" / f"{info['train_step']:012d}"
-    temporary = final.with_suffix(".tmp")
     try:
-        shutil.rmtree(temporary, ignore_errors=True)
-        temporary.mkdir(parents=True)
+        temporary = new_folder(final)
         for file, arrays in zip(FILES, (state, batch), strict=False):
             save_file({name: np.asarray(array, order="C") for name, array in arrays.items()}, temporary / file)
         (temporary / FILES[-1]).write_text(json.dumps(incident, indent=2, allow_nan=False) + "\n", encoding="utf-8")
         seal(temporary, FILES)
         if final.exists():
-            shutil.rmtree(final)
+            remove_folder(final, (*FILES, SUMS))
         temporary.rename(final)
         flush(final.parent)
     except (OSError, SafetensorError) as error:
@@ -148,7 +146,7 @@ def stop_error(path: Path, info: Mapping[str, Any]) -> UserError:
 
 def newest_incident(logdir: Path) -> Path | None:
     """The folder of the last incident of a log directory, if it has any."""
-    return max((path for path in (logdir / "nonfinite").glob("*") if path.name.isdecimal()), default=None, key=lambda path: path.name)
+    return max((path for path in entries(logdir / "nonfinite") if re.fullmatch("[0-9]{12}", path.name)), default=None)
 
 
 def load_incident(path: Path) -> Incident:
@@ -158,14 +156,15 @@ def load_incident(path: Path) -> Incident:
       UserError: a file is missing or damaged, or of another format.
     """
     try:
-        require_intact(path, FILES)
-        info = read_json(path / FILES[-1])
+        sealed = open_sealed(path, FILES)
+        require_intact(sealed, FILES)
+        info = sealed.json(FILES[-1])
         if info.get("format") != FORMAT:
             raise ValueError(f"format {info.get('format')!r}; this version reads format {FORMAT}")
         _check(info)
         metrics, repeated = _from_json(info.pop("metrics")), _from_json(info.pop("repeated"))
         tallies = [_tally_from_json(entry) for entry in info.pop("tensors")]
-        return Incident(path, info, metrics, repeated, tallies, read_arrays(path / FILES[0]), read_arrays(path / FILES[1]))
+        return Incident(path, info, metrics, repeated, tallies, sealed.arrays(FILES[0]), sealed.arrays(FILES[1]))
     except (OSError, ValueError) as error:
         raise UserError(f"the incident {path} is damaged: {error}") from error
 

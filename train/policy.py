@@ -8,8 +8,9 @@ policy/
 
 import dataclasses
 import json
-import shutil
+import os
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from reference_numpy import agent, training_loop
 from reference_numpy.shapes import require_shape
 from spec import Discrete, Spaces, Vector
 from train.errors import UserError
-from train.files import flush, read_arrays, read_json, require_intact, seal
+from train.files import SUMS, flush, new_folder, open_sealed, remove_folder, require_intact, seal
 from train.saved_agent import SavedAgent, acting_table, check_info, checked_parameters, config_from_json
 
 FORMAT = 1
@@ -49,13 +50,14 @@ class Policy:
         """
         path = Path(path)
         try:
-            require_intact(path, (PARAMETERS, DESCRIPTION))
-            info = read_json(path / DESCRIPTION)
+            sealed = open_sealed(path, (PARAMETERS, DESCRIPTION))
+            require_intact(sealed, (PARAMETERS, DESCRIPTION))
+            info = sealed.json(DESCRIPTION)
             if info.get("format") != FORMAT:
                 raise ValueError(f"{DESCRIPTION} has format {info.get('format')!r:.80}; this version reads format {FORMAT}")
             spaces, config = Spaces.from_json(info.pop("spaces", None)), config_from_json(info.pop("config", None))
             check_info(info, spaces)
-            parameters = checked_parameters(read_arrays(path / PARAMETERS), acting_table(config, spaces))
+            parameters = checked_parameters(sealed.arrays(PARAMETERS), acting_table(config, spaces))
         except (OSError, ValueError) as error:
             raise UserError(f"cannot load the policy {path}: {error!s:.500}; `train export` writes it anew") from error
         return cls(SavedAgent(config, spaces, parameters, info))
@@ -156,18 +158,20 @@ def save(path: Path, saved: SavedAgent) -> None:
     Raises:
       UserError: the path exists already, or the disk refuses.
     """
-    if path.exists():
+    if os.path.lexists(path):
         raise UserError(f"{path} exists already; remove it, or choose another folder for the policy")
-    temporary = path.with_name(f"{path.name}.tmp")
+    temporary = None
     description = {"format": FORMAT, **saved.info, "spaces": saved.spaces.to_json(), "config": dataclasses.asdict(saved.config)}
     acting = {name: saved.parameters[name] for name in acting_table(saved.config, saved.spaces)}
     try:
-        shutil.rmtree(temporary, ignore_errors=True)
-        temporary.mkdir(parents=True)
+        temporary = new_folder(path)
         save_file(acting, temporary / PARAMETERS)
         (temporary / DESCRIPTION).write_text(json.dumps(description, indent=2) + "\n", encoding="utf-8")
         seal(temporary, (PARAMETERS, DESCRIPTION))
         temporary.rename(path)
         flush(path.parent)
     except (OSError, SafetensorError) as error:
+        if temporary:
+            with suppress(OSError):
+                remove_folder(temporary, (PARAMETERS, DESCRIPTION, SUMS))
         raise UserError(f"cannot write the policy {path}: {error}") from error

@@ -2,23 +2,27 @@
 
 import dataclasses
 import json
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from train import checkpoint
+from reference_numpy.training_loop import can_train
+from train import checkpoint, saved_run
 from train.about import options_json, read_about
-from train.checkpoint import Arrays, Checkpoint, Damaged
+from train.checkpoint import Checkpoint, Damaged
 from train.envs import Environments, History, Record
 from train.errors import UserError
+from train.files import Arrays, entries
 from train.finite import settle
+from train.logdir import note_first_checkpoint, require_free
 from train.logger import Display
 from train.options import Options
+from train.replay import Replay, set_aside
 from train.state import Counters, Means, Run
 
-COUNTERS = {name: type(value) for name, value in dataclasses.asdict(Counters()).items()}
 NOT_CHANGES = ("backend", "device", "logdir", "resume", "preflight", "from_")  # each start says its own
 FROM_BOUNDARY = "new episodes begin, those under way when it was saved are abandoned"
 
@@ -55,31 +59,35 @@ def save(run: Run) -> Path:
         "replay": description,
     }
     path = checkpoint.save(run.options.logdir, run.step, run.learner.state_dict(), loop, info, run.options.keep_checkpoints)
+    note_first_checkpoint(run.options.logdir)
     run.replay.replay.keep([path.name for path in checkpoint.candidates(run.options.logdir)])
     return path
 
 
 def find(options: Options, display: Display) -> Checkpoint | None:
-    """The newest checkpoint that is not damaged; those that are get another name, loudly.
+    """The newest checkpoint that is not damaged; those that are get another name, loudly. [LOOP-22], [LOOP-50]
 
     Raises:
-      UserError: all are damaged, or the newest sound one is of another configuration or format.
+      Unreadable: one cannot be read now. Nothing has changed.
+      UserError: all are damaged, the newest sound one is of another configuration or format, or there is none and no run may begin here.
     """
     found = checkpoint.candidates(options.logdir)
     for path in found:
         try:
             saved = checkpoint.open_checkpoint(path)
         except Damaged as error:
-            give_up(path, error, display)
+            aside = checkpoint.set_aside(path)
+            display.say(f"WARNING: {error}; renamed to {aside}, going back to the checkpoint before")
             continue
-        _require_sound(saved)
+        saved_run.check_info(saved)
         checkpoint.require_same_identity(saved, options.identity())
         return saved
-    damaged = sorted((options.logdir / "checkpoints").glob("*.damaged"))
+    damaged = [path for path in entries(options.logdir / "checkpoints") if re.search(r"\.damaged(-[0-9]+)?$", path.name)]
     if damaged:
         raise UserError(
             f"{options.logdir} has damaged checkpoints only: {', '.join(map(str, damaged))}; to begin anew, choose another --logdir"
         )
+    require_free(options.logdir)
     return None
 
 
@@ -96,9 +104,40 @@ def changes(saved: Checkpoint, options: Options) -> dict[str, list[Any]]:
     return {name: [before[name], now[name]] for name in names if before[name] != now[name]}
 
 
-def give_up(path: Path, error: Exception, display: Display) -> None:
-    """Puts a damaged checkpoint aside, so that the one before it is the newest."""
-    display.say(f"WARNING: {error}; renamed to {checkpoint.set_aside(path)}, going back to the checkpoint before")
+def restore_replay(
+    saved: Checkpoint, options: Options, settings: Mapping[str, Any], exactly: bool, display: Display
+) -> tuple[Replay, bool]:
+    """The buffer of a checkpoint, and whether it is the one that the checkpoint was saved with.
+
+    If its saved state is damaged, the newest older one takes its place, or an empty buffer if there is none: parameters and counters are
+    kept whatever happens to the buffer. [LOOP-53]
+
+    Raises:
+      Unreadable: the buffer is away or cannot be read now. Nothing has changed.
+    """
+    directory, config = options.logdir / "replay", options.config
+    description: Any = saved.info["replay"]
+    for older in [saved.path, *(path for path in checkpoint.candidates(options.logdir) if path.name < saved.path.name)]:
+        is_own = older == saved.path
+        try:
+            description = description if is_own else checkpoint.open_checkpoint(older).info.get("replay")
+            replay = Replay.restore(
+                directory, description, config.replay_capacity, config.batch_length, continue_streams=exactly and is_own, **settings
+            )
+        except (ValueError, Damaged) as error:
+            display.say(f"WARNING: {error}")
+            continue
+        for line in replay.warnings:
+            display.say(f"replay: {line}")
+        if not is_own:
+            display.say(f"WARNING: the buffer is that of {older}, with {len(replay):,} sequences; what was recorded later is lost")
+        return replay, is_own
+    aside = set_aside(directory)
+    display.say(
+        f"WARNING: no state of the replay buffer is sound, so the run goes on with an empty one. Its files are now in {aside}; "
+        "parameters and counters are those of the checkpoint"
+    )
+    return Replay(config.replay_capacity, config.batch_length, directory, **settings), False
 
 
 def restore_environments(saved: Checkpoint, envs: Environments, display: Display) -> Record | None:
@@ -118,76 +157,35 @@ def restore_environments(saved: Checkpoint, envs: Environments, display: Display
     return record
 
 
-def restore(run: Run, saved: Checkpoint, exactly: bool) -> None:
-    """Continues where the checkpoint stopped: [LOOP-23]. exactly: the environments were restored, so carries and scores go on."""
+def restore(run: Run, saved: Checkpoint, exactly: bool, own_buffer: bool = True) -> None:
+    """Continues where the checkpoint stopped: [LOOP-23].
+
+    exactly: the environments were restored, so carries and scores go on. own_buffer: so does the batch drawn ahead; another buffer does
+    not have its records.
+
+    Raises:
+      UserError: what the checkpoint holds does not fit.
+    """
     info, arrays = saved.info, saved.loop
     try:
         run.learner.load_state_dict(saved.learner)
-        run.replay.load_drawn(arrays)
+        if own_buffer:
+            run.replay.load_drawn(arrays)
         run.ratio.load_state_dict(info["replay_ratio"])
-        if exactly:
-            carry, scores = _without_prefix("carry/", arrays), _without_prefix("scores/", arrays)
-            _require_same_form(run.learner.save_carry(run.carry), carry)
-            _require_same_form(vars(run.scores), scores)
-            run.carry, run.scores.total, run.scores.length = run.learner.load_carry(carry), scores["total"], scores["length"]
-    except (ValueError, KeyError, ZeroDivisionError) as error:
+        if not can_train(len(run.replay), run.options.config):  # What was lost of the buffer is recorded again, and is not paid for twice.
+            run.ratio.load_state_dict({**info["replay_ratio"], "step": None})
+    except ValueError as error:
         raise UserError(f"the checkpoint {saved.path} does not fit this version: {error}") from error
+    if exactly:
+        scores = _without_prefix("scores/", arrays)
+        run.carry = run.learner.load_carry(_without_prefix("carry/", arrays))
+        run.scores.total, run.scores.length = scores["total"], scores["length"]
     run.counters = Counters(**info["counters"])
     run.random_return, run.evaluation = info["random_return"], info["evaluation"]
     run.returns.extend(info["returns"])
     run.means = Means(info["metrics"])
     made_by = "" if info["backend"] == run.options.backend else f", which {info['backend']} has trained so far"
     run.display.say(f"continuing at step {run.step:,} from {saved.path}{made_by}")
-
-
-def _require_sound(saved: Checkpoint) -> None:
-    """Whoever forges a description forges its checksum too: what is of another type must be an error, not a traceback.
-
-    Raises:
-      UserError: the names of what is missing or of another type.
-    """
-    info = saved.info
-    sound = {
-        "identity": isinstance(info.get("identity"), dict),
-        "spaces": _is_of(info.get("spaces"), lambda entries: isinstance(entries, dict)),
-        "backend": isinstance(info.get("backend"), str),
-        "counters": isinstance(info.get("counters"), dict)
-        and {name: type(value) for name, value in info["counters"].items()} == COUNTERS
-        and all(0 <= value < 2**63 for value in info["counters"].values()),
-        "environments": isinstance(info.get("environments"), list)
-        and all(entry is None or (_is_of(entry, _is_count) and entry.keys() == {"seed", "episode"}) for entry in info["environments"]),
-        "replay_ratio": _is_of(info.get("replay_ratio"), lambda value: value is None or isinstance(value, str | int)),
-        "random_return": info.get("random_return") is None or _is_number(info["random_return"]),
-        "evaluation": info.get("evaluation") is None
-        or (_is_of(info["evaluation"], _is_number) and info["evaluation"].keys() == {"step", "return"}),
-        "returns": isinstance(info.get("returns"), list) and all(map(_is_number, info["returns"])),
-        "metrics": _is_of(
-            info.get("metrics"), lambda mean: isinstance(mean, list) and len(mean) == 2 and all(map(_is_number, mean)) and mean[1] >= 1
-        ),
-        "log": _is_count(info.get("log")),
-        "replay": isinstance(info.get("replay"), dict),
-    }
-    wrong = [name for name, is_sound in sound.items() if name not in info or not is_sound]
-    if wrong:
-        raise UserError(f"the checkpoint {saved.path} does not fit this version: run.json lacks a sound {', '.join(wrong)}")
-
-
-def _require_same_form(expected: Mapping[str, np.ndarray], arrays: Mapping[str, np.ndarray]) -> None:
-    for name, array in expected.items():
-        if arrays[name].shape != array.shape or arrays[name].dtype != array.dtype:
-            raise ValueError(f"{name} is {arrays[name].dtype}{list(arrays[name].shape)}; expected {array.dtype}{list(array.shape)}")
-
-
-def _is_of(value: Any, is_sound: Callable[[Any], bool]) -> bool:
-    return isinstance(value, dict) and all(map(is_sound, value.values()))
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def _is_count(value: Any) -> bool:
-    return type(value) is int and 0 <= value < 2**63
 
 
 def _prefixed(prefix: str, arrays: Mapping[str, Any]) -> Arrays:

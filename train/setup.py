@@ -11,7 +11,7 @@ import numpy as np
 
 from reference_numpy.training_loop import ReplayRatio, derive_seed
 from spec import Spaces, parameter_table
-from train import checkpoint, resume, threads
+from train import checkpoint, logdir, resume, saved_run, threads
 from train.about import write_about
 from train.backend import Learner, learner_class
 from train.checkpoint import Checkpoint
@@ -58,7 +58,11 @@ def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -
         _hold_logdir(options, stack)
         if resume.find(options, display):
             raise UserError(f"another process has begun a run in {options.logdir} meanwhile; the same command continues it")
-    replay, saved, record = _open_replay(options, saved, envs, display)
+    if saved:
+        saved_run.check_arrays(saved, envs.spaces, options.config, envs.count, agent.save_carry(agent.initial_carry(envs.count)))
+    else:
+        logdir.claim(options.logdir)  # Before anything else is written there.
+    replay, record, own_buffer = _open_replay(options, saved, envs, display)
     starts, step = _progress(options, saved)
     changed = resume.changes(saved, options) if saved else {}
     about = write_about(
@@ -99,7 +103,7 @@ def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -
             f"beginning with the parameters of {origin['checkpoint']} ({origin['task']}, step {origin['step']:,}), a fresh optimizer"
         )
     if saved:
-        resume.restore(run, saved, exactly=record is not None)
+        resume.restore(run, saved, exactly=record is not None, own_buffer=own_buffer)
     else:
         _measure_random_policy(run)
     run.counters.starts += record is None
@@ -140,19 +144,7 @@ def _hold_logdir(options: Options, stack: ExitStack) -> None:
     Raises:
       UserError: another process holds it, or it cannot be written.
     """
-    import fcntl  # Not on Windows, where `train eval` needs this module too.
-
-    try:
-        options.logdir.mkdir(parents=True, exist_ok=True)
-        lock = stack.enter_context((options.logdir / ".lock").open("w"))
-    except OSError as error:
-        raise UserError(f"cannot write to the log directory {options.logdir}: {error.strerror}; choose another with --logdir") from error
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        raise UserError(f"another process is training in {options.logdir}; let it end, or choose another with --logdir") from error
-    except OSError:
-        pass  # Some network file systems have no locks: there it is left to the user.
+    logdir.hold(options.logdir, stack)
 
 
 def _require_trainable(options: Options) -> None:
@@ -259,35 +251,18 @@ def make_learner(learner: type[Learner], options: Options, spaces: Spaces) -> Le
 
 def _open_replay(
     options: Options, saved: Checkpoint | None, envs: Environments, display: Display
-) -> tuple[Prefetcher, Checkpoint | None, Record | None]:
-    """The buffer in LOGDIR/replay, the checkpoint that it is from, and the records of the environments if they were restored.
-
-    A checkpoint whose buffer is damaged is given up for the one before.
-    """
+) -> tuple[Prefetcher, Record | None, bool]:
+    """The buffer in LOGDIR/replay, the records of the environments if they were restored, and whether it is the checkpoint's own buffer."""
     config, directory = options.config, options.logdir / "replay"
     settings: dict[str, Any] = {
         "memory_limit": int(options.replay_memory * 2**30),
         "deter_dtype": options.replay_deter,
         "classes": config.classes,
     }
-    replay = record = None
-    while saved and replay is None:
+    record, own_buffer = None, True
+    if saved:
         record = resume.restore_environments(saved, envs, display) if options.restore_envs else None
-        try:
-            replay = Replay.restore(
-                directory,
-                saved.info["replay"],
-                config.replay_capacity,
-                config.batch_length,
-                continue_streams=record is not None,
-                **settings,
-            )
-        except ValueError as error:
-            resume.give_up(saved.path, error, display)
-            saved = resume.find(options, display)
-    if replay is not None:
-        for line in replay.warnings:
-            display.say(f"replay: {line}")
+        replay, own_buffer = resume.restore_replay(saved, options, settings, record is not None, display)
     else:
         erase(directory)
         replay = Replay(config.replay_capacity, config.batch_length, directory, **settings)
@@ -295,7 +270,7 @@ def _open_replay(
     def uniform(train_step: int) -> np.ndarray:
         return np.random.Generator(np.random.PCG64(derive_seed(options.seed, "replay", train_step))).random(config.batch_size)
 
-    return Prefetcher(replay, uniform, saved.info["counters"]["train_steps"] if saved else 0), saved, record
+    return Prefetcher(replay, uniform, saved.info["counters"]["train_steps"] if saved else 0), record, own_buffer
 
 
 def _measure_random_policy(run: Run) -> None:

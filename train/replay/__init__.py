@@ -2,6 +2,6 @@
 
 from train.replay.buffer import Replay
 from train.replay.prefetch import Prefetcher
-from train.replay.saves import erase
+from train.replay.saves import erase, set_aside
 
-__all__ = ["Prefetcher", "Replay", "erase"]
+__all__ = ["Prefetcher", "Replay", "erase", "set_aside"]

@@ -14,6 +14,7 @@ import errno
 import json
 import mmap
 import os
+import re
 import resource
 import zlib
 from collections.abc import Iterator
@@ -23,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from train.errors import UserError
+from train.files import Unreadable, entries, open_file, reading
 from train.replay.layout import Layout, Sections
 
 PAGE = 4096
@@ -115,7 +117,7 @@ class ChunkStore:
                     write_all(file.fileno(), self.shape.header(number), 0)
                 self._spare.pop().rename(path)
                 return
-            fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o644)
+            fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o644)  # Never over a file that is there already.
             try:
                 reserve(fd, self.shape.file_bytes)
                 write_all(fd, self.shape.header(number), 0)
@@ -172,34 +174,41 @@ class ChunkStore:
             self.path(number).unlink(missing_ok=True)
 
     def problem(self, number: int) -> str | None:
-        """What is wrong with the file as such, or None."""
+        """What is wrong with the file as such, or None.
+
+        Raises:
+          Unreadable: [REP-35].
+        """
+        path = self.path(number)
         try:
-            size = self.path(number).stat().st_size
-            if size != self.shape.file_bytes:
-                return f"has {size} bytes, expected {self.shape.file_bytes}"
-            with self.path(number).open("rb") as file:
+            with open_file(path) as file, reading_chunk(path):
+                size = os.fstat(file.fileno()).st_size
+                if size != self.shape.file_bytes:
+                    return f"has {size} bytes, expected {self.shape.file_bytes}"
                 return None if file.read(self.shape.header_bytes) == self.shape.header(number) else "has a damaged header"
         except FileNotFoundError:
             return "is missing"
-        except OSError as error:
-            return f"cannot be read: {error.strerror}"
+        except ValueError:
+            return "is not a file"
 
     def damage(self, chunk: Chunk, block: int) -> str | None:
-        """What of the content disagrees with its checksums, or None. Reads all of it, through no mapping."""
+        """What of the content disagrees with its checksums, or None. Reads all of it, through no mapping.
+
+        Raises:
+          Unreadable: [REP-35].
+        """
         names = ["records", *self.layout.large, "latents"]
-        try:
-            with self.path(chunk.number).open("rb", buffering=0) as file:
-                for section, expected in enumerate(chunk.sums):
-                    total = 0
-                    for data in self._pieces(file.fileno(), section, chunk.count):
-                        total = zlib.crc32(data, total)
-                    if total != expected:
-                        return f"is damaged: the checksum of {names[section]} is {total:08x}, expected {expected:08x}"
-                sums = self.latents_sums(file.fileno(), chunk.count, block, range(-(-chunk.count // block)))
-                if not np.array_equal(sums, chunk.block_sums[: len(sums)]):
-                    return "is damaged: a checksum of latents differs"
-        except OSError as error:
-            return f"cannot be read: {error.strerror}"
+        path = self.path(chunk.number)
+        with open_file(path) as file, reading_chunk(path):
+            for section, expected in enumerate(chunk.sums):
+                total = 0
+                for data in self._pieces(file.fileno(), section, chunk.count):
+                    total = zlib.crc32(data, total)
+                if total != expected:
+                    return f"is damaged: the checksum of {names[section]} is {total:08x}, expected {expected:08x}"
+            sums = self.latents_sums(file.fileno(), chunk.count, block, range(-(-chunk.count // block)))
+            if not np.array_equal(sums, chunk.block_sums[: len(sums)]):
+                return "is damaged: a checksum of latents differs"
         return None
 
     def latents_sums(self, fd: int, count: int, block: int, blocks: range) -> list[int]:
@@ -226,9 +235,36 @@ def chunk_path(directory: Path, number: int) -> Path:
 
 
 def chunk_numbers(directory: Path) -> list[int]:
-    """The numbers of all chunk files of a directory."""
-    stems = (path.stem.removeprefix("chunk-") for path in directory.glob("chunk-*.bin"))
-    return sorted(int(stem) for stem in stems if stem.isdigit())
+    """The numbers of all chunk files of a directory, and of no other file: [REP-36]."""
+    return [number for number in numbers(directory, "chunk-", ".bin") if is_chunk(chunk_path(directory, number))]
+
+
+def numbers(directory: Path, prefix: str, suffix: str) -> list[int]:
+    """Of the plain files <prefix><ten digits><suffix> of a directory, in their order.
+
+    Raises:
+      Unreadable.
+    """
+    pattern = re.compile(f"{re.escape(prefix)}([0-9]{{10}}){re.escape(suffix)}")
+    found = [(path, match) for path in entries(directory) if (match := pattern.fullmatch(path.name))]
+    return [int(match[1]) for path, match in found if path.is_file() and not path.is_symlink()]
+
+
+def is_chunk(path: Path) -> bool:
+    """Whether a file begins as ours do, or as one whose making was interrupted: with zeros, or not at all."""
+    with open_file(path) as file, reading_chunk(path):
+        start = file.read(len(MAGIC))
+    return start == MAGIC.encode() or not start.strip(b"\0")
+
+
+@contextlib.contextmanager
+def reading_chunk(path: Path) -> Iterator[None]:
+    """As train.files.reading, with what to do about a file that no mending helps."""
+    try:
+        with reading(path):
+            yield
+    except Unreadable as error:
+        raise Unreadable(f"{error}; or move that file away: the run then goes on without its records") from error
 
 
 def reserve(fd: int, size: int) -> None:
@@ -260,9 +296,9 @@ def disk_errors(directory: Path) -> Iterator[None]:
         yield
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            raise UserError(
-                f"the disk of the replay directory {directory} is full; the last checkpoint is intact: make room and give the same command"
-            ) from error
+            is_saved = any(numbers(directory, "saved-", ".safetensors"))
+            kept = "the last checkpoint is intact" if is_saved else "there is no checkpoint yet"
+            raise UserError(f"the disk of the replay directory {directory} is full; {kept}: make room and give the same command") from error
         raise UserError(f"cannot use the replay directory {directory}: {error}") from error
 
 

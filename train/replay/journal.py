@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from train.replay.chunks import disk_errors, write_all
+from train.files import open_file, reading
+from train.replay.chunks import disk_errors, numbers, write_all
 
 _HEADER = struct.Struct("<QIII")
 
@@ -37,7 +38,7 @@ class Journal:
     def __init__(self, directory: Path, epoch: int) -> None:
         self._directory = directory
         with disk_errors(directory):
-            self._fd = os.open(journal_path(directory, epoch), os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o644)
+            self._fd = os.open(journal_path(directory, epoch), os.O_RDWR | os.O_CREAT | os.O_TRUNC | getattr(os, "O_NOFOLLOW", 0), 0o644)
         self._size = 0
 
     def append(self, chunk: int, row: int, latents: NDArray[np.uint8]) -> None:
@@ -76,14 +77,18 @@ def journal_path(directory: Path, epoch: int) -> Path:
 
 def journal_epochs(directory: Path) -> list[int]:
     """The epochs of all journals of a directory, oldest first."""
-    stems = (path.stem.removeprefix("journal-") for path in directory.glob("journal-*.bin"))
-    return sorted(int(stem) for stem in stems if stem.isdigit())
+    return numbers(directory, "journal-", ".bin")
 
 
 def entries(path: Path, row_bytes: int) -> Iterator[Entry]:
-    """The complete entries of a journal file, oldest first."""
-    size, offset = path.stat().st_size, 0
-    with path.open("rb") as file:
+    """The complete entries of a journal file, oldest first.
+
+    Raises:
+      Unreadable.
+    """
+    offset = 0
+    with open_file(path) as file, reading(path):
+        size = os.fstat(file.fileno()).st_size
         while offset + _HEADER.size <= size:
             file.seek(offset)
             chunk, row, rows, checksum = _HEADER.unpack(file.read(_HEADER.size))
@@ -95,7 +100,7 @@ def entries(path: Path, row_bytes: int) -> Iterator[Entry]:
 
 def old_latents(path: Path, entry: Entry, row_bytes: int) -> NDArray[np.uint8] | None:
     """The bytes [rows, row_bytes] of an entry, or None if its checksum disagrees."""
-    with path.open("rb") as file:
+    with open_file(path) as file, reading(path):
         file.seek(entry.offset)
         data = file.read(entry.rows * row_bytes)
     if zlib.crc32(data) != entry.sum:

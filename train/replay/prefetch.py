@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from train.replay.batches import Batch
+from train.replay.batches import Batch, empty_batch, require_same_form
 from train.replay.buffer import Replay
 from train.replay.layout import Packed
 
@@ -92,9 +92,18 @@ class Prefetcher:
         return self.replay.save(name), drawn
 
     def load_drawn(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Takes up the batch that was drawn when a checkpoint was made: to be called before anything else."""
+        """Takes up the batch that was drawn when a checkpoint was made: to be called before anything else. [REP-38]
+
+        Raises:
+          ValueError: it is not of the form of a batch of this buffer.
+        """
         batch = {key.removeprefix(_SAVED): np.array(array) for key, array in arrays.items() if key.startswith(_SAVED)}
         if batch:
+            storage = self.replay.storage
+            if storage is None:
+                raise ValueError("a batch was drawn ahead of a buffer that holds nothing")
+            require_same_form(batch, empty_batch(storage.layout, len(self._uniform(self.step)), self.replay.length))
+            storage.layout.require_indices("stoch of the batch drawn ahead", batch["stoch"])
             self._drawn = concurrent.futures.Future()
             self._drawn.set_result(batch)
 

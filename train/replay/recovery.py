@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from train.files import open_file
 from train.replay.chunks import Chunk, ChunkStore, Shape
 from train.replay.items import are_representable, decode, encode
 from train.replay.journal import entries, journal_epochs, journal_path, old_latents
@@ -71,17 +72,29 @@ def restore(replay: Replay, description: Mapping[str, Any], continue_streams: bo
     """See Replay.restore. It may be interrupted at any point and done again."""
     arrays, facts = read_saved(replay.directory, description)
     storage = _matching_storage(replay, arrays, facts)
+    chunks = _usable_chunks(storage, arrays, replay.warnings) if storage is not None else {}
+    require_readable(replay.directory, facts["epoch"])
     for epoch in saved_epochs(replay.directory):
         if epoch > facts["epoch"]:  # Before the undoing, which spoils them.
             saved_path(replay.directory, epoch).unlink()
     replay.next_stream = facts["next_stream"]
     if storage is not None:
-        chunks = _usable_chunks(storage, arrays, replay.warnings)
         _undo(storage, chunks, facts["epoch"], replay.warnings)
         _leave_out_damaged(storage, chunks, replay.warnings)
         _rebuild(replay, storage, arrays, chunks, continue_streams)
     needed = {chunk.number for stream in replay.streams.values() for chunk in stream.chunks.values()}
     replay.history.resume(facts["epoch"], set(arrays["chunks"][:, 0].tolist()), needed, replay.warnings)
+
+
+def require_readable(directory: Path, epoch: int) -> None:
+    """That the journals from an epoch on can be read, before the first of them is used: [REP-35].
+
+    Raises:
+      Unreadable.
+    """
+    for number in journal_epochs(directory):
+        if number >= epoch:
+            open_file(journal_path(directory, number)).close()
 
 
 def _matching_storage(replay: Replay, arrays: Arrays, facts: Mapping[str, Any]) -> Storage | None:

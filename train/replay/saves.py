@@ -10,6 +10,7 @@ deleted when no kept save refers to it.
 import dataclasses
 import json
 import os
+import re
 import zlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -17,15 +18,17 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
-from train.replay.chunks import chunk_numbers, chunk_path, disk_errors
+from train.files import Unreadable, entries, open_file, reading, replacing
+from train.replay.chunks import chunk_numbers, chunk_path, disk_errors, numbers
 from train.replay.journal import Journal, journal_epochs, journal_path
 
 FORMAT = 1
 _ARRAYS = {"items": (1,), "queue": (1,), "streams": (2, 3), "chunks": (2, 4), "sums": (2,), "block_sums": (2,), "workers": (2, 2)}
 _UNSIGNED = ("sums", "block_sums")
+_UNFINISHED = re.compile(r"\.saved-[0-9]{10}\.safetensors-[0-9a-f]{8}\.tmp")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,19 +75,11 @@ class History:
         metadata = json.dumps({**facts, "format": FORMAT, "name": name, "epoch": epoch})
         data = save({key: np.ascontiguousarray(array) for key, array in arrays.items()}, metadata={"replay": metadata})
         path = saved_path(self.directory, epoch)
-        temporary = path.with_suffix(".tmp")
         with disk_errors(self.directory):
-            try:
-                with temporary.open("wb") as file:
-                    file.write(data)
-                    file.flush()
-                    os.fsync(file.fileno())
-                journal = Journal(self.directory, epoch)
-                temporary.rename(path)
-                flush_directory(self.directory)
-            except OSError:
-                temporary.unlink(missing_ok=True)
-                raise
+            with replacing(path) as file:
+                file.write(data)
+                journal = Journal(self.directory, epoch)  # Before the name: a state that can be restored has a journal.
+            flush_directory(self.directory)
         if self.journal:
             self.journal.close()
         self.journal, self.epoch = journal, epoch
@@ -118,9 +113,12 @@ class History:
         for other in saved_epochs(self.directory):
             try:
                 self.kept[other] = read_kept(saved_path(self.directory, other))
-            except ValueError as error:
+            except (FileNotFoundError, ValueError) as error:
                 warnings.append(f"{error}: this older state is given up")
-                saved_path(self.directory, other).unlink()
+                saved_path(self.directory, other).unlink(missing_ok=True)
+        for path in entries(self.directory):
+            if _UNFINISHED.fullmatch(path.name):  # A process was killed while it wrote it.
+                path.unlink(missing_ok=True)
         present = chunk_numbers(self.directory)
         self.next_chunk = max([*present, *chunks], default=-1) + 1
         for chunk in present:
@@ -134,56 +132,98 @@ def saved_path(directory: Path, epoch: int) -> Path:
 
 def saved_epochs(directory: Path) -> list[int]:
     """The epochs of all saved states of a directory, oldest first."""
-    stems = (path.stem.removeprefix("saved-") for path in directory.glob("saved-*.safetensors"))
-    return sorted(int(stem) for stem in stems if stem.isdigit())
+    return numbers(directory, "saved-", ".safetensors")
 
 
 def erase(directory: Path) -> None:
-    """Deletes the files of a replay buffer from a directory, and nothing else."""
-    for file in buffer_files(directory):
-        file.unlink()
+    """Deletes the files of a replay buffer from a directory, and nothing else.
+
+    Raises:
+      UserError: the disk refuses it.
+    """
+    with disk_errors(directory):
+        for file in buffer_files(directory):
+            file.unlink()
+
+
+def set_aside(directory: Path) -> Path:
+    """Moves the files of a replay buffer that cannot be restored into a new folder in it, which is returned. [REP-37]
+
+    Raises:
+      UserError: the disk refuses it.
+    """
+    names = (directory / f"damaged{'' if number == 1 else f'-{number}'}" for number in range(1, 1000))
+    folder = next(path for path in names if not os.path.lexists(path))
+    with disk_errors(directory):
+        folder.mkdir()
+        for file in buffer_files(directory):
+            file.rename(folder / file.name)
+    return folder
 
 
 def buffer_files(directory: Path) -> list[Path]:
-    return [path for pattern in ("chunk-*.bin", "journal-*.bin", "saved-*") for path in sorted(directory.glob(pattern))]
+    """The files of a directory that are a replay buffer's: [REP-36].
+
+    Raises:
+      Unreadable.
+    """
+    chunks = [chunk_path(directory, number) for number in chunk_numbers(directory)]
+    journals = [journal_path(directory, epoch) for epoch in journal_epochs(directory)]
+    states = [saved_path(directory, epoch) for epoch in saved_epochs(directory)]
+    return [*chunks, *journals, *states, *(path for path in entries(directory) if _UNFINISHED.fullmatch(path.name))]
 
 
 def read_kept(path: Path) -> Saved:
     """Raises:
+    FileNotFoundError, Unreadable.
     ValueError: the file is damaged; the message names it.
     """
-    try:
-        with safe_open(path, framework="numpy") as file:
-            facts = json.loads((file.metadata() or {})["replay"])
-            return Saved(str(facts["name"]), frozenset(file.get_tensor("chunks")[:, 0].tolist()))
-    except (OSError, SafetensorError, KeyError, TypeError, IndexError, ValueError, RecursionError) as error:
-        raise ValueError(f"the replay file {path} is damaged: {error}") from error
+    arrays, facts = _parse(path, _read(path))
+    return Saved(str(facts["name"]), frozenset(arrays["chunks"][:, 0].tolist()))
 
 
 def read_saved(directory: Path, description: Any) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     """The arrays and the facts of a saved state, its checksum compared.
 
     Raises:
-      ValueError: the description is none, or the file is missing, damaged, or of another format; the message names the file.
+      Unreadable: also where the directory holds no buffer at all: then it is away, and not damaged.
+      ValueError: the description is none, or the file is missing, damaged or of another format; the message names the file.
     """
     try:
         name, expected = str(description["file"]), int(description["crc32"])
         known = description["format"] == FORMAT
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"not a description of a replay state: {error!r}") from error
+        raise ValueError(f"not a description of a replay state: {error!r:.200}") from error
+    if not known or not re.fullmatch(r"saved-[0-9]{10}\.safetensors", name):
+        raise ValueError(f"not a description of a replay state of format {FORMAT}: {description!r:.200}")
     path = directory / name
-    if not known or path.name != name:
-        raise ValueError(f"not a description of a replay state of format {FORMAT}: {description!r}")
     try:
-        data = path.read_bytes()
-        if zlib.crc32(data) != expected:
-            raise ValueError(f"checksum {zlib.crc32(data):08x}, expected {expected:08x}")
+        data = _read(path)
+    except FileNotFoundError:
+        if buffer_files(directory) or (directory / "damaged").is_dir():
+            raise ValueError(f"the replay file {path} is missing") from None
+        raise Unreadable(
+            f"the replay buffer is away: {directory} holds none of its files. Nothing was changed: mount its disk or put the files back, "
+            f"and give the same command. If they are lost for good, make an empty file {path}: the run then goes on with an empty buffer"
+        ) from None
+    if zlib.crc32(data) != expected:
+        raise ValueError(f"the replay file {path} is damaged: checksum {zlib.crc32(data):08x}, expected {expected:08x}")
+    return _parse(path, data)
+
+
+def _read(path: Path) -> bytes:
+    with open_file(path) as file, reading(path):
+        return file.read()
+
+
+def _parse(path: Path, data: bytes) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+    try:
         arrays = load(data)
-        with safe_open(path, framework="numpy") as file:
-            facts = json.loads((file.metadata() or {})["replay"])
+        header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])  # load has looked at it, and gives no metadata
+        facts = json.loads(header["__metadata__"]["replay"])
         _require_arrays(arrays, facts)
-    except (OSError, SafetensorError, KeyError, TypeError, ValueError, RecursionError) as error:
-        raise ValueError(f"the replay file {path} is damaged: {error}") from error
+    except (SafetensorError, KeyError, TypeError, IndexError, ValueError, RecursionError) as error:
+        raise ValueError(f"the replay file {path} is damaged: {error!s:.300}") from error
     return arrays, facts
 
 
