@@ -48,6 +48,13 @@ def test_a_right_backend_passes(dtype: str) -> None:
     assert preflight("numpy", SPACES, config(dtype)).passed
 
 
+def test_it_tells_what_agrees_as_soon_as_it_does() -> None:
+    told: list[str] = []
+    report = preflight("numpy", SPACES, config("float32"), progress=told.append)
+    assert told == [comparison.name for comparison in report.comparisons]
+    assert "encoder" in told
+
+
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 @pytest.mark.parametrize(
     "start", ["critic/", "actor/hidden0/kernel", "rssm/gru/bias", "encoder/image/conv0/kernel", "reward/out/bias", "continue/hidden0/scale"]

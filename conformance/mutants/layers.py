@@ -49,7 +49,7 @@ MUTANTS = (
         provenance="plausible: the mathematical convolution",
         violates=("LAY-6",),
         fix="Correlate: the kernel as it is.",
-        edits={"layers.convolution": {"kernel[row, column]": "kernel[KERNEL - 1 - row, KERNEL - 1 - column]"}},
+        edits={"layers.convolution": {"kernel.reshape(seen": "kernel[::-1, ::-1].reshape(seen"}},
     ),
     Mutant(
         name="convolution_padded_on_the_other_side",
