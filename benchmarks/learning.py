@@ -81,7 +81,7 @@ def draw(path: Path, title: str, runs: list[dict[str, Any]], metrics: list[str])
 
     A run that is shorter than its first episode has no returns to draw.
     """
-    panels = [name for name in (EPISODES, *metrics) if any(run[name] for run in runs)]
+    panels = [name for name in (EPISODES, *metrics) if any(run[name] for run in runs)] or [EPISODES]
     columns, rows = min(len(panels), 3), -(-len(panels) // 3)
     figure = Figure(figsize=(8 if len(panels) == 1 else 4.2 * columns, 4.2 * rows), dpi=130, layout="constrained")
     figure.suptitle(title, x=0.01, ha="left", fontsize=11)

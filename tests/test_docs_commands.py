@@ -127,6 +127,8 @@ def test_a_line_runs_as_it_is_printed(prepared: Path, tmp_path: Path, line: str)
     shutil.copytree(prepared, folder)
     if line.startswith("conformance new-adapter"):
         (folder / "my_adapter.py").unlink()  # it writes a new one, and replaces none
+    if line.startswith("conformance lockstep"):
+        shutil.copy(ROOT / "tests" / "reference_adapter.py", folder / "my_adapter.py")  # whole train steps, not two functions
     shorter = longest(SHORTER, line)
     separator = " --" if line.startswith("python -m benchmarks.learning") and " -- " not in line else ""
     line = line.replace("/opt/old_env/", "ENV/")

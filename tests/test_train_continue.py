@@ -159,8 +159,9 @@ def test_what_cannot_be_resumed_is_named(capsys: pytest.CaptureFixture[str]) -> 
     assert "--task train_fakes:Counting" in refusal(capsys, "resume", "run")
     assert "batch_size: 2 in the checkpoint, 8 given. These may not change" in refusal(capsys, "resume", "run", *task, "--batch-size=8")
     assert "task: train_fakes:Counting in the checkpoint" in refusal(capsys, "resume", "run", "--task", "train_fakes:Endless")
-    assert "--preset cannot be given" in refusal(capsys, "resume", "run", *task, "--preset", "cartpole")
-    assert "--from, --logdir cannot be given" in refusal(capsys, "resume", "run", "--logdir", "a", "--from", "b")
+    assert "seed: 0 in the checkpoint, 3 given" in refusal(capsys, "resume", "run", *task, "--seed=3")
+    for name in ("--preset", "--logdir", "--from", "--seeds", "--resume"):  # with these a run begins
+        assert f"unknown option {name}" in refusal(capsys, "resume", "run", *task, name, "1")
     assert "continued from its log directory, run" in refusal(capsys, "resume", "run/checkpoints/000000000060", *task)
     assert "nowhere has no run.json" in refusal(capsys, "resume", "nowhere")
     assert "unknown option --step; did you mean --steps?" in refusal(capsys, "resume", "run", "--step=7")

@@ -299,6 +299,6 @@ def test_details_of_an_error_are_printed_before_its_line(monkeypatch: pytest.Mon
     def fail(arguments: object) -> None:
         raise UserError("one line\nonly", "Traceback:\n  File ...\n")
 
-    monkeypatch.setattr(cli, "parse", fail)
+    monkeypatch.setattr(cli, "parse_runs", fail)
     assert cli.main(["--backend", "jax"]) == 2
     assert capsys.readouterr().err == "Traceback:\n  File ...\ntrain: error: one line only\n"

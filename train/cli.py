@@ -153,27 +153,28 @@ class Parser(argparse.ArgumentParser):
         raise UserError(f"{message} (see {self.prog} --help)")
 
 
-class _Formatter(argparse.RawDescriptionHelpFormatter):
+class Formatter(argparse.RawDescriptionHelpFormatter):
     def __init__(self, prog: str) -> None:
         super().__init__(prog, max_help_position=34, width=120)
 
 
 def build_parser() -> argparse.ArgumentParser:
     """Every option without a default: what is not given comes from the preset, see train/options.py."""
-    parser = Parser(prog="train", description=DESCRIPTION, formatter_class=_Formatter, usage=USAGE, allow_abbrev=False)
+    parser = Parser(prog="train", description=DESCRIPTION, formatter_class=Formatter, usage=USAGE, allow_abbrev=False)
     parser.epilog = "Where the pages docs/*.md are: conformance docs"
     parser.add_argument("--version", action="version", version=f"dreamer-spec {own_version()}")
     add_options(parser)
     return parser
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """The options of a run, for `train` and for `train resume`."""
+def add_options(parser: argparse.ArgumentParser, begins: bool = True) -> None:
+    """The options of a run. begins: those too with which `train` begins one, and which a run that `train resume` continues has already."""
     base = presets()["base"]
 
     run = parser.add_argument_group("run")
     run.add_argument("--backend", choices=BACKENDS, help="which implementation trains")
-    run.add_argument("--preset", metavar="NAME", help=_preset_help())
+    if begins:
+        _add_beginning(run.add_argument)
     run.add_argument(
         "--task", metavar="SUITE:NAME", help="gym:ID, dmc:DOMAIN-TASK (vectors), dmc_vision:DOMAIN-TASK (images) or MODULE:CALLABLE"
     )
@@ -186,24 +187,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     run.add_argument("--steps", type=_whole(1), metavar="N", help=f"environment steps, with action repeat (default {base['steps']:,})")
     run.add_argument("--seed", type=_whole(0), metavar="N", help="seed of everything random (default 0)")
-    run.add_argument(
-        "--seeds", type=_seeds, metavar="N-M,...", help="several runs, one after the other: 0-4 or 0,2,5; with --logdir, in DIR/seedN"
-    )
-    run.add_argument("--logdir", type=Path, metavar="DIR", help="metrics, checkpoint and picture (default runs/TASK-BACKEND-seedN)")
-    run.add_argument(
-        "--from", dest="from_", type=Path, metavar="RUN", help="a new run begins with the parameters of this one, or of a checkpoint"
-    )
     run.add_argument("--device", metavar="NAME", help="cpu, gpu, cuda:1, ... (default: the backend's choice)")
     run.add_argument(
         "--threads",
         type=_whole(1),
         metavar="N",
         help="that compute on the CPU (default: by backend, model size and cores; see docs/runs.md)",
-    )
-    run.add_argument(
-        "--resume",
-        choices=RESUME,
-        help="auto: continue the run in the log directory if there is one (default); never, must: or else an error",
     )
     run.add_argument(
         "--nonfinite",
@@ -273,6 +262,19 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         groups[entry["group"]].add_argument(
             f"--{name.replace('_', '-')}", dest=name, type=kind, metavar=metavar, choices=entry.get("choices"), help=_help(name, entry)
         )
+
+
+def _add_beginning(add: Callable[..., Any]) -> None:
+    """Which run: its preset, seeds, log directory and first parameters."""
+    add("--preset", metavar="NAME", help=_preset_help())
+    add("--seeds", type=_seeds, metavar="N-M,...", help="several runs, one after the other: 0-4 or 0,2,5; with --logdir, in DIR/seedN")
+    add("--logdir", type=Path, metavar="DIR", help="metrics, checkpoint and picture (default runs/TASK-BACKEND-seedN)")
+    add("--from", dest="from_", type=Path, metavar="RUN", help="a new run begins with the parameters of this one, or of a checkpoint")
+    add(
+        "--resume",
+        choices=RESUME,
+        help="auto: continue the run in the log directory if there is one (default); never, must: or else an error",
+    )
 
 
 def _with_dashes(argument: str) -> str:

@@ -107,7 +107,7 @@ def next_commands(options: Options, step: int) -> list[str]:
         f"{train} report {run}",
         f"{train} eval {run} --episodes 100{task}",
         f"{train} export {run} policy",
-        f"{train} resume {run} --steps {2 * step}{task}",
+        f"{train} resume {run} --steps {2 * max(step, first_train_step(options))}{task}",
     ]
 
 

@@ -63,8 +63,8 @@ class TorchAdapter:
         wanted = [parameter.annotation for parameter in inspect.signature(function).parameters.values()]
 
         def call(*arguments: Any) -> Any:
-            # A single number is an array where the function wants one.
-            arrays = (np.asarray(x) if np.isscalar(x) and kind in ARRAYS else x for x, kind in zip(arguments, wanted, strict=True))
+            # A single number is an array where the function wants one. What has a default, the interface may not know.
+            arrays = (np.asarray(x) if np.isscalar(x) and kind in ARRAYS else x for x, kind in zip(arguments, wanted, strict=False))
             converted = [self._enter(x) for x in arrays]
             if narrow and isinstance(converted[0], torch.Tensor) and converted[0].is_floating_point():
                 converted[0] = converted[0].to(DTYPES[self._dtype])

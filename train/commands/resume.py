@@ -1,6 +1,5 @@
 """`train resume RUN`: continues a run with the options that it was started with, which run.json holds, but for those given anew."""
 
-import argparse
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -8,7 +7,7 @@ from typing import Any
 
 from train.about import read_about
 from train.checkpoint import candidates
-from train.cli import Parser, add_options, build_parser, options_of
+from train.cli import Formatter, Parser, add_options, build_parser, options_of
 from train.errors import UserError
 from train.options import Options, names_code
 
@@ -19,9 +18,8 @@ DESCRIPTION = """Continue a run from its newest checkpoint, with the options tha
 
 Options that are given here take the place of the run's own. What may change half way: --steps, how it is evaluated, logged and saved,
 processes, the backend, the replay ratio, and the hyperparameters of world model learning, actor and critic learning, and optimizer.
-run.json records every change. A task that is a module of your own must be repeated with --task: it names code that would run."""
-
-NOT_HERE = ("seeds", "from_", "preset", "logdir", "resume")  # they begin a run, or say which
+run.json records every change. Log directory and seed are the run's.
+A task that is a module of your own must be repeated with --task: it names code that would run."""
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -38,17 +36,11 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _parse(arguments: Sequence[str]) -> dict[str, Any]:
-    formatter = argparse.RawDescriptionHelpFormatter
     usage = "train resume RUN [options]"
-    parser = Parser(prog="train resume", description=DESCRIPTION, formatter_class=formatter, usage=usage, allow_abbrev=False)
+    parser = Parser(prog="train resume", description=DESCRIPTION, formatter_class=Formatter, usage=usage, allow_abbrev=False)
     parser.add_argument("run", type=Path, metavar="RUN", help="its log directory")
-    add_options(parser)
-    values = vars(parser.parse_args(arguments))
-    wrong = [name for name in NOT_HERE if values[name] is not None]
-    if wrong:
-        flags = ", ".join(f"--{name.rstrip('_')}" for name in wrong)
-        parser.error(f"{flags} cannot be given: a run that goes on has its own; a new run is begun with train --backend")
-    return values
+    add_options(parser, begins=False)
+    return vars(parser.parse_args(arguments))
 
 
 def _options(run: Path, given: Mapping[str, Any]) -> Options:
