@@ -46,7 +46,7 @@ def make_moody(where: str, counter: Path, patience: int, index: int) -> Contract
 
 @pytest.mark.parametrize("processes", [False, True])
 @pytest.mark.parametrize("where", ["make", "reset"])
-@pytest.mark.covers("LOOP-45", "LOOP-46")
+@pytest.mark.covers("LOOP-32", "LOOP-46")
 def test_what_fails_now_and_then_before_the_first_record_is_tried_again(tmp_path: Path, where: str, processes: bool) -> None:
     envs = Environments(functools.partial(make_moody, where, tmp_path / "counter", 2), 1, processes)
     try:
@@ -86,7 +86,7 @@ def test_a_trial_finds_the_spaces_and_slow_steps(task: str, deserves: bool) -> N
 
 
 @pytest.mark.parametrize("where", ["reset", "step"])
-@pytest.mark.covers("LOOP-45", "LOOP-46")
+@pytest.mark.covers("LOOP-32", "LOOP-46")
 def test_an_environment_that_fails_in_its_trial_gets_a_process(tmp_path: Path, where: str) -> None:
     told: list[Failure] = []
     task = "train_fakes:wrong_dtype"
@@ -147,7 +147,7 @@ RAISED = [
 
 @pytest.mark.parametrize("error", RAISED, ids=lambda error: type(error).__name__)
 @pytest.mark.parametrize("processes", [False, True])
-@pytest.mark.covers("LOOP-45")
+@pytest.mark.covers("LOOP-32")
 def test_whatever_an_environment_raises_is_a_failure(processes: bool, error: BaseException) -> None:
     with stoppable():  # Where Ctrl-C does not raise a KeyboardInterrupt, so one is the environment's.
         details = assert_restarted(
@@ -157,7 +157,7 @@ def test_whatever_an_environment_raises_is_a_failure(processes: bool, error: Bas
 
 
 @pytest.mark.parametrize("processes", [False, True])
-@pytest.mark.covers("LOOP-45")
+@pytest.mark.covers("LOOP-32")
 def test_an_observation_that_raises_is_a_failure(processes: bool) -> None:
     assert "__array__" in assert_restarted(make_evil, processes, "SystemExit: 0")
 
@@ -184,7 +184,7 @@ def assert_restarted(make: Callable[[int], ContractEnv], processes: bool, words:
     return failure.details
 
 
-@pytest.mark.covers("LOOP-45")
+@pytest.mark.covers("LOOP-32")
 def test_ctrl_c_is_no_failure() -> None:
     envs = Environments(lambda index: ContractEnv(train_fakes.Faulty(1, error=KeyboardInterrupt()), "t", index), 1, False)
     envs.reset([0])
