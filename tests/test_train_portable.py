@@ -156,6 +156,16 @@ def test_an_evaluation_shows_its_progress_and_what_failed(
     assert "length 5 (min 5, max 5)" in out
 
 
+@pytest.mark.covers("LOOP-46")
+def test_an_environment_that_cannot_be_made_ends_the_evaluation(counting: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["eval", counting, "--episodes", "1", "--task", "train_surroundings:Unmakeable"]) == 2
+    *trace, line = capsys.readouterr().err.splitlines()
+    words = "task train_surroundings:Unmakeable, environment 0, when it was made: the environment raised SystemExit: 0 (3 attempts)"
+    assert line == f"train: error: {words}"
+    assert trace[0].startswith("Traceback")
+    assert "train_surroundings.py" in "".join(trace)
+
+
 # One checkpoint for both backends
 
 
