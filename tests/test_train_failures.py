@@ -2,7 +2,6 @@
 
 import functools
 import os
-import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -110,11 +109,20 @@ def make_stuck(environment: dict[str, str], index: int) -> ContractEnv:
     return make_env("train_surroundings:Stuck", index)
 
 
-def test_a_function_that_cannot_be_pickled_is_named() -> None:
-    lock = threading.Lock()
-    with pytest.raises(UserError, match=r"the function that makes environments cannot be pickled: .*TypeError") as error:
-        Environments(lambda index: ContractEnv(train_fakes.Counting(), str(lock), index), 1, True)
-    assert "Traceback" in error.value.details
+class Unpicklable:
+    def __init__(self, error: BaseException) -> None:
+        self._error = error
+
+    def __reduce__(self) -> Any:
+        raise self._error
+
+
+@pytest.mark.parametrize("error", [TypeError("not this"), SystemExit(0)])
+@pytest.mark.covers("LOOP-32")
+def test_a_function_that_cannot_be_pickled_is_said(error: BaseException) -> None:
+    unpicklable = Unpicklable(error)
+    with pytest.raises(UserError, match=f"its process cannot be started: .*{type(error).__name__}: {error}"):
+        Environments(lambda index: ContractEnv(train_fakes.Counting(), str(unpicklable), index), 1, True)
 
 
 # Whatever is raised
@@ -182,6 +190,23 @@ def assert_restarted(make: Callable[[int], ContractEnv], processes: bool, words:
     assert len(failure.message) < 2_000
     assert len(failure.details) <= 20_000
     return failure.details
+
+
+@pytest.mark.covers("LOOP-32")
+def test_a_process_that_ends_without_a_word_is_not_said_to_have_said_something() -> None:
+    class Leaving(train_fakes.Counting):
+        def step(self, action: np.ndarray) -> Any:
+            os._exit(0)
+
+    envs = Environments(lambda index: ContractEnv(Leaving(), "t", index), 1, True)
+    try:
+        envs.reset([0])
+        assert envs.step(CALM)["is_first"].all()
+    finally:
+        envs.close()
+    (failure,) = envs.take_failures()
+    assert failure.kind == "crash"
+    assert failure.message == "task t, environment 0, step 1: its process ended with exit code 0; if it said why, that is above"
 
 
 @pytest.mark.covers("LOOP-32")
