@@ -4,10 +4,10 @@ import contextlib
 import io
 import os
 import sys
-from typing import Any, TextIO
+from typing import IO, Any, TextIO
 
 
-class _Unfailing(io.FileIO):
+class _Descriptor(io.FileIO):
     """A file descriptor that takes everything: what cannot be written (a closed pipe or terminal, a full disk) is dropped."""
 
     def write(self, data: Any) -> int:
@@ -41,7 +41,7 @@ def _unfailing(stream: io.TextIOWrapper) -> TextIO:
     """The same stream: same descriptor, encoding and buffering."""
     with contextlib.suppress(OSError):
         stream.flush()
-    raw = _Unfailing(stream.fileno(), "w", closefd=False)
+    raw = _Descriptor(stream.fileno(), "w", closefd=False)
     return io.TextIOWrapper(
         raw if stream.write_through else io.BufferedWriter(raw),
         stream.encoding,
@@ -49,3 +49,35 @@ def _unfailing(stream: io.TextIOWrapper) -> TextIO:
         line_buffering=stream.line_buffering,
         write_through=stream.write_through,
     )
+
+
+class Unfailing(io.TextIOBase):
+    """Any stream of text, such as a notebook's: what it cannot take is dropped, what it cannot encode is escaped."""
+
+    def __init__(self, stream: IO[str]) -> None:
+        self._stream = stream
+
+    @property
+    def encoding(self) -> str:  # type: ignore[override]
+        return getattr(self._stream, "encoding", None) or "utf-8"
+
+    def write(self, text: str) -> int:
+        with contextlib.suppress(OSError, ValueError):  # ValueError: it is closed.
+            try:
+                self._stream.write(text)
+            except UnicodeEncodeError:
+                self._stream.write(text.encode(self.encoding, "backslashreplace").decode(self.encoding))
+        return len(text)
+
+    def flush(self) -> None:
+        with contextlib.suppress(OSError, ValueError):
+            self._stream.flush()
+
+    def isatty(self) -> bool:
+        try:
+            return self._stream.isatty()
+        except (OSError, ValueError, AttributeError):
+            return False
+
+    def fileno(self) -> int:
+        return self._stream.fileno()

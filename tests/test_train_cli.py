@@ -91,7 +91,7 @@ def test_bad_environments(capsys: pytest.CaptureFixture[str], task: str, words: 
 def test_missing_extra(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "dm_env", None)
     monkeypatch.delitem(sys.modules, "train.envs.dm_control", raising=False)
-    assert "pip install 'dreamer-spec[dm-control]'" in refusal(capsys, *FAST, "--task", "dmc:walker-walk")
+    assert "pip install 'dreamer-spec[dm-control]'" in refusal(capsys, *FAST, "--task", "dmc:walker-walk", "--processes", "no")
 
 
 def test_missing_backend(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

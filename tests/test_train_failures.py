@@ -2,7 +2,6 @@
 
 import functools
 import os
-import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -46,7 +45,7 @@ def make_moody(where: str, counter: Path, patience: int, index: int) -> Contract
 
 @pytest.mark.parametrize("processes", [False, True])
 @pytest.mark.parametrize("where", ["make", "reset"])
-@pytest.mark.covers("LOOP-45", "LOOP-46")
+@pytest.mark.covers("LOOP-32", "LOOP-46")
 def test_what_fails_now_and_then_before_the_first_record_is_tried_again(tmp_path: Path, where: str, processes: bool) -> None:
     envs = Environments(functools.partial(make_moody, where, tmp_path / "counter", 2), 1, processes)
     try:
@@ -86,7 +85,7 @@ def test_a_trial_finds_the_spaces_and_slow_steps(task: str, deserves: bool) -> N
 
 
 @pytest.mark.parametrize("where", ["reset", "step"])
-@pytest.mark.covers("LOOP-45", "LOOP-46")
+@pytest.mark.covers("LOOP-32", "LOOP-46")
 def test_an_environment_that_fails_in_its_trial_gets_a_process(tmp_path: Path, where: str) -> None:
     told: list[Failure] = []
     task = "train_fakes:wrong_dtype"
@@ -110,11 +109,20 @@ def make_stuck(environment: dict[str, str], index: int) -> ContractEnv:
     return make_env("train_surroundings:Stuck", index)
 
 
-def test_a_function_that_cannot_be_pickled_is_named() -> None:
-    lock = threading.Lock()
-    with pytest.raises(UserError, match=r"the function that makes environments cannot be pickled: .*TypeError") as error:
-        Environments(lambda index: ContractEnv(train_fakes.Counting(), str(lock), index), 1, True)
-    assert "Traceback" in error.value.details
+class Unpicklable:
+    def __init__(self, error: BaseException) -> None:
+        self._error = error
+
+    def __reduce__(self) -> Any:
+        raise self._error
+
+
+@pytest.mark.parametrize("error", [TypeError("not this"), SystemExit(0)])
+@pytest.mark.covers("LOOP-32")
+def test_a_function_that_cannot_be_pickled_is_said(error: BaseException) -> None:
+    unpicklable = Unpicklable(error)
+    with pytest.raises(UserError, match=f"its process cannot be started: .*{type(error).__name__}: {error}"):
+        Environments(lambda index: ContractEnv(train_fakes.Counting(), str(unpicklable), index), 1, True)
 
 
 # Whatever is raised
@@ -147,7 +155,7 @@ RAISED = [
 
 @pytest.mark.parametrize("error", RAISED, ids=lambda error: type(error).__name__)
 @pytest.mark.parametrize("processes", [False, True])
-@pytest.mark.covers("LOOP-45")
+@pytest.mark.covers("LOOP-32")
 def test_whatever_an_environment_raises_is_a_failure(processes: bool, error: BaseException) -> None:
     with stoppable():  # Where Ctrl-C does not raise a KeyboardInterrupt, so one is the environment's.
         details = assert_restarted(
@@ -157,7 +165,7 @@ def test_whatever_an_environment_raises_is_a_failure(processes: bool, error: Bas
 
 
 @pytest.mark.parametrize("processes", [False, True])
-@pytest.mark.covers("LOOP-45")
+@pytest.mark.covers("LOOP-32")
 def test_an_observation_that_raises_is_a_failure(processes: bool) -> None:
     assert "__array__" in assert_restarted(make_evil, processes, "SystemExit: 0")
 
@@ -184,7 +192,24 @@ def assert_restarted(make: Callable[[int], ContractEnv], processes: bool, words:
     return failure.details
 
 
-@pytest.mark.covers("LOOP-45")
+@pytest.mark.covers("LOOP-32")
+def test_a_process_that_ends_without_a_word_is_not_said_to_have_said_something() -> None:
+    class Leaving(train_fakes.Counting):
+        def step(self, action: np.ndarray) -> Any:
+            os._exit(0)
+
+    envs = Environments(lambda index: ContractEnv(Leaving(), "t", index), 1, True)
+    try:
+        envs.reset([0])
+        assert envs.step(CALM)["is_first"].all()
+    finally:
+        envs.close()
+    (failure,) = envs.take_failures()
+    assert failure.kind == "crash"
+    assert failure.message == "task t, environment 0, step 1: its process ended with exit code 0; if it said why, that is above"
+
+
+@pytest.mark.covers("LOOP-32")
 def test_ctrl_c_is_no_failure() -> None:
     envs = Environments(lambda index: ContractEnv(train_fakes.Faulty(1, error=KeyboardInterrupt()), "t", index), 1, False)
     envs.reset([0])

@@ -281,3 +281,38 @@ def test_live_progress_says_the_phase(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "a line [of] its own" in text.getvalue()
     display.phase("after the end")
     assert json.dumps(text.getvalue()).count("after the end") == 1
+
+
+class Broken(io.StringIO):
+    """What `error` is raised by every write."""
+
+    def __init__(self, error: Exception) -> None:
+        super().__init__()
+        self._error = error
+
+    def write(self, text: str) -> int:
+        raise self._error
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+@pytest.mark.parametrize("error", [BrokenPipeError(), OSError(28, "No space left on device"), ValueError("I/O operation on closed file")])
+@pytest.mark.covers("LOOP-45")
+def test_a_display_that_nobody_can_see_goes_on(monkeypatch: pytest.MonkeyPatch, error: Exception, terminal: bool) -> None:
+    file = Broken(error)
+    monkeypatch.setattr(module, "Console", lambda: Console(file=file, width=100))
+    monkeypatch.setattr(file, "isatty", lambda: terminal)
+    with Display(10) as display:
+        display.say("a line")
+        display.phase("compiling")
+        display.update(3, ["return 3"])
+
+
+@pytest.mark.covers("LOOP-45")
+def test_what_an_encoding_lacks_is_escaped(monkeypatch: pytest.MonkeyPatch) -> None:
+    raw = io.BytesIO()
+    file = io.TextIOWrapper(raw, "ascii")
+    monkeypatch.setattr(module, "Console", lambda: Console(file=file, width=100))
+    display = Display(10)
+    display.say("\N{MIDDLE DOT} \udcff")
+    display.say("more")
+    assert raw.getvalue() == b"\\xb7 \\udcff\nmore\n"

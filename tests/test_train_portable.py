@@ -141,6 +141,7 @@ def test_an_evaluation_shows_its_progress_and_what_failed(
     counting: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("train.logger.PLAIN_EVERY", 0.0)
+    monkeypatch.setattr("train.envs.trial.SLOW_STEP", math.inf)  # So it is in this process.
     step, calls = train_fakes.Counting.step, []
 
     def fails_once(self: train_fakes.Counting, action: np.ndarray) -> Any:
@@ -151,8 +152,18 @@ def test_an_evaluation_shows_its_progress_and_what_failed(
     assert main(["eval", counting, *COUNT, "1"]) == 0
     out = capsys.readouterr().out
     assert "  0%  evaluation 0/1 episodes" in out
-    assert "environment 0 was made anew, its episode is abandoned (error): " in out
+    assert "environment 0 failed and was restarted (error): " in out
     assert "length 5 (min 5, max 5)" in out
+
+
+@pytest.mark.covers("LOOP-46")
+def test_an_environment_that_cannot_be_made_ends_the_evaluation(counting: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["eval", counting, "--episodes", "1", "--task", "train_surroundings:Unmakeable"]) == 2
+    *trace, line = capsys.readouterr().err.splitlines()
+    words = "task train_surroundings:Unmakeable, environment 0, when it was made: the environment raised SystemExit: 0 (3 attempts)"
+    assert line == f"train: error: {words}"
+    assert trace[0].startswith("Traceback")
+    assert "train_surroundings.py" in "".join(trace)
 
 
 # One checkpoint for both backends

@@ -159,6 +159,7 @@ def test_a_reader_that_leaves_does_not_end_a_run(tmp_path: Path, buffered: str) 
 
 
 @pytest.mark.parametrize("processes", [NO, YES])
+@pytest.mark.covers("LOOP-45")
 def test_a_full_disk_under_the_output_does_not_end_a_run(tmp_path: Path, processes: tuple[str, ...]) -> None:
     with open("/dev/full", "w") as full:
         assert start("Talking", tmp_path / "run", *processes, output=full).wait(60) == 0
@@ -166,6 +167,7 @@ def test_a_full_disk_under_the_output_does_not_end_a_run(tmp_path: Path, process
 
 
 @pytest.mark.parametrize("redirection", [">&-", "2>&-", "<&- >&- 2>&-"])
+@pytest.mark.covers("LOOP-45")
 def test_closed_outputs_do_not_end_a_run_and_get_no_files(tmp_path: Path, redirection: str) -> None:
     """The first file that is opened must not become the standard output."""
     process = start("Talking", tmp_path / "run", *YES, shell=f'exec "$@" {redirection}')
@@ -176,6 +178,7 @@ def test_closed_outputs_do_not_end_a_run_and_get_no_files(tmp_path: Path, redire
 
 
 @pytest.mark.parametrize("processes", [NO, YES])
+@pytest.mark.covers("LOOP-45")
 def test_characters_that_the_output_cannot_hold_are_escaped(tmp_path: Path, processes: tuple[str, ...]) -> None:
     process = start("Unprintable", tmp_path / "run", *processes, PYTHONIOENCODING="ascii", LC_ALL="C")
     out, error = process.communicate(timeout=60)
@@ -185,6 +188,7 @@ def test_characters_that_the_output_cannot_hold_are_escaped(tmp_path: Path, proc
     assert finished(tmp_path)
 
 
+@pytest.mark.covers("LOOP-45")
 def test_a_terminal_with_a_live_display_that_goes_away_does_not_end_a_run(tmp_path: Path) -> None:
     """Rich draws from a thread of its own."""
     leader, terminal = os.openpty()

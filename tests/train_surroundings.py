@@ -55,6 +55,13 @@ class Talking(Counting):
         return super().step(action)
 
 
+class Unmakeable(Counting):
+    """Asks the process to end as if all were well."""
+
+    def __init__(self) -> None:
+        sys.exit(0)
+
+
 class WordlessError(Exception):
     def __str__(self) -> str:
         raise ValueError("no words")

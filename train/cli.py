@@ -211,10 +211,10 @@ def add_options(parser: argparse.ArgumentParser, begins: bool = True) -> None:
     envs.add_argument("--processes", choices=PROCESSES, help="one process per environment; auto: if its steps are slow (default)")
 
     envs.add_argument(
-        "--env-timeout", type=_seconds, metavar="SECONDS", help="a process that takes longer for a step is made anew (default 600)"
+        "--env-timeout", type=_seconds, metavar="SECONDS", help="a process that takes longer for a step is restarted (default 600)"
     )
     envs.add_argument(
-        "--env-failures", type=_whole(0), metavar="N", help="environments made anew, per 100,000 steps, that end the run (default 10)"
+        "--env-failures", type=_whole(0), metavar="N", help="failures of environments, per 100,000 steps, that end the run (default 10)"
     )
     envs.add_argument(
         "--restore-envs",

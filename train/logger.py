@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any, BinaryIO
+from typing import IO, Any, BinaryIO, cast
 
 import numpy as np
 from PIL import Image
@@ -18,6 +18,7 @@ from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 from tensorboard.compat.proto.summary_pb2 import Summary
 from tensorboard.summary.writer.event_file_writer import EventFileWriter
 
+from conformance.output import Unfailing
 from train.about import About
 from train.errors import UserError, writing
 from train.files import open_file, reading
@@ -229,7 +230,7 @@ def _numbers(text: bytes) -> dict[str, float] | None:
 
 
 class Display:
-    """What goes on, as a live line on a terminal, while the display is entered; elsewhere a line now and then.
+    """What goes on, as a live line on a terminal, while the display is entered; elsewhere a line now and then. Never fails: [LOOP-45].
 
     total: environment steps of the run.
     """
@@ -237,6 +238,7 @@ class Display:
     def __init__(self, total: int) -> None:
         self._total = total
         self._console = Console()
+        self._console.file = cast(IO[str], Unfailing(self._console.file))  # Rich ends the process where a reader has gone.
         self._progress: Progress | None = None
         self._phase = ""
         self._printed = time.monotonic()

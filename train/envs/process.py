@@ -6,14 +6,10 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable
 from multiprocessing import connection
 
-import cloudpickle
-
 from conformance.output import never_fail
-from train.envs.adapter import ContractEnv
-from train.envs.failure import Failure, attempt, describe
+from train.envs.failure import describe
 from train.signals import NUMBERS
 
 DYING = 5.0  # seconds that a process has to be gone after it was killed
@@ -25,24 +21,6 @@ REMEDIES = {
     errno.ENOMEM: "use fewer environments (--envs) or --processes no",
     errno.ENOSPC: "free space in the folder for temporary files or in /dev/shm, or use --processes no",
 }
-
-
-class Packed:
-    """A function that makes environments, as bytes: what it does when it is unpickled happens only when it is called.
-
-    Raises:
-      UserError: it cannot be pickled.
-    """
-
-    def __init__(self, make: Callable[[int], ContractEnv]) -> None:
-        packed = attempt(lambda: bytes(cloudpickle.dumps(make)), 0, lambda: "the function that makes environments cannot be pickled")
-        if isinstance(packed, Failure):
-            raise packed.error(1)
-        self._bytes = packed
-
-    def __call__(self, index: int) -> ContractEnv:
-        env: ContractEnv = cloudpickle.loads(self._bytes)(index)
-        return env
 
 
 def start_method() -> str:

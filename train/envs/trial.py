@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import functools
 import multiprocessing
 import time
 from collections.abc import Callable, Iterator
@@ -9,11 +10,12 @@ from multiprocessing import connection
 from typing import Any
 
 import numpy as np
+from gymnasium.vector.utils import CloudpickleWrapper
 
 from spec import Spaces
 from train.envs.adapter import ContractEnv
 from train.envs.failure import Failure, attempt
-from train.envs.process import DYING, Packed, begin_worker, ended, no_answer, not_started, start_method
+from train.envs.process import DYING, begin_worker, ended, no_answer, not_started, start_method
 from train.envs.spaces import random_actions
 from train.signals import unbroken
 
@@ -91,15 +93,14 @@ def _deserves_process(receive: Callable[[str], Any], tell: Tell) -> bool:
 @contextlib.contextmanager
 def _process(make: Make, task: str, seed: int | None, timeout: float) -> Iterator[Callable[[str], Any]]:
     """A function that returns the next answer of `_look`, or a Failure."""
-    packed = Packed(make)
     try:
         context: Any = multiprocessing.get_context(start_method())
         with unbroken():
             ours, theirs = context.Pipe(duplex=False)
-            process = context.Process(target=_look, args=(packed, task, seed, theirs), daemon=True)
+            process = context.Process(target=_look, args=(CloudpickleWrapper(functools.partial(make, 0)), task, seed, theirs), daemon=True)
             process.start()
             theirs.close()
-    except Exception as error:
+    except (Exception, SystemExit) as error:  # What is pickled may raise anything.
         failure = Failure(0, "crash", f"{_place(task, 'when it was made')}: {not_started(error)}", certain=True)
         yield lambda what: failure
         return
@@ -127,10 +128,10 @@ def _process(make: Make, task: str, seed: int | None, timeout: float) -> Iterato
         ours.close()
 
 
-def _look(make: Make, task: str, seed: int | None, pipe: connection.Connection) -> None:
+def _look(make: Callable[[], ContractEnv], task: str, seed: int | None, pipe: connection.Connection) -> None:
     """Runs in the process. Answers with the task and its spaces, then with None after a reset, then with the seconds of a step."""
     begin_worker()
-    env = attempt(lambda: make(0), 0, lambda: _place(task, "when it was made"))
+    env = attempt(make, 0, lambda: _place(task, "when it was made"))
     if isinstance(env, Failure):
         pipe.send(env)
         return

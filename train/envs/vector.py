@@ -14,7 +14,6 @@ from train.envs.adapter import ContractEnv
 from train.envs.failure import Failure
 from train.envs.history import Episode, History
 from train.envs.info import EpisodeInfo
-from train.envs.process import Packed
 from train.envs.stream import Step
 from train.envs.trial import Trial, make_here, try_out
 from train.envs.worker import InProcess, OwnProcess, Worker, receive
@@ -72,10 +71,9 @@ class Environments:
         self._action = np.zeros((count, self.spaces.action_size), np.float32)
         self._pending = False  # whether actions were sent off whose records have not been asked for
         self._workers: list[Worker] = []
-        packed = Packed(make) if processes else None
         for index in range(count):
-            if packed:
-                self._workers.append(OwnProcess(packed, index, known.task, self.spaces, timeout))
+            if processes:
+                self._workers.append(OwnProcess(make, index, known.task, self.spaces, timeout))
             else:
                 self._workers.append(InProcess(make, index, known.task, self.spaces, None if index else first))
 

@@ -95,7 +95,7 @@ class OwnProcess:
                 makers = [self._make_stream]
                 self._envs = AsyncVectorEnv(makers, copy=False, context=start_method(), autoreset_mode=AutoresetMode.DISABLED)
                 (self.pipe,) = self._envs.parent_pipes
-        except Exception as error:  # `receive` will say so.
+        except (Exception, SystemExit) as error:  # `receive` will say so. What is pickled may raise anything.
             self._not_started = not_started(error)
 
     def step(self, action: np.ndarray) -> None:
