@@ -22,7 +22,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from train.files import Unreadable, entries, open_file, reading, replacing
-from train.replay.chunks import chunk_numbers, chunk_path, disk_errors, numbers
+from train.replay.chunks import chunk_numbers, chunk_path, disk_errors, next_number, numbers
 from train.replay.journal import Journal, journal_epochs, journal_path
 
 FORMAT = 1
@@ -119,9 +119,8 @@ class History:
         for path in entries(self.directory):
             if _UNFINISHED.fullmatch(path.name):  # A process was killed while it wrote it.
                 path.unlink(missing_ok=True)
-        present = chunk_numbers(self.directory)
-        self.next_chunk = max([*present, *chunks], default=-1) + 1
-        for chunk in present:
+        self.next_chunk = max([next_number(self.directory), *(chunk + 1 for chunk in chunks)])
+        for chunk in chunk_numbers(self.directory):
             if chunk not in needed and self.retire(chunk):
                 chunk_path(self.directory, chunk).unlink()
 
