@@ -20,10 +20,11 @@ from train_runs import Make, run_quietly
 
 from conformance.problems import small_config
 from spec import Spaces, Vector
-from train import checkpoint, files, loop
+from train import checkpoint, files, loop, setup
 from train.cli import main
 from train.errors import UserError
 from train.files import Unreadable
+from train.replay import Replay
 
 CONFIG = small_config("paper", "float32")
 TASK = Spaces({"position": Vector(3)}, {"arm": Vector(2)})
@@ -397,3 +398,54 @@ def test_a_training_state_that_is_not_finite_is_refused(make: Make) -> None:
     save_file(state, folder / "learner.safetensors")
     files.seal(folder, checkpoint.FILES)
     assert "params/w holds numbers that are not finite" in refused(make(steps=90))
+
+
+# Too large for the machine
+
+
+@pytest.mark.parametrize("task", ["Enormous", "EnormousActions"])
+def test_spaces_that_no_machine_holds_are_refused(make: Make, task: str) -> None:
+    with pytest.raises(UserError, match=r"becomes [0-9,]{13,} numbers; expected at most 1,048,576"):
+        loop.run(make(task=f"train_fakes:{task}"), FakeLearner)
+
+
+def test_a_model_that_the_machine_cannot_hold_is_refused(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(setup, "FITS", 0.0)
+    monkeypatch.setattr(setup, "describe", lambda: {"memory_gib": 1e-5})
+    with pytest.raises(UserError, match=r"parameters take .* GiB for training, and this machine has 1e-05: choose a smaller --size"):
+        loop.run(make(), FakeLearner)
+
+
+@pytest.mark.parametrize("error", [MemoryError("Unable to allocate 8.00 EiB"), RuntimeError("RESOURCE_EXHAUSTED: Out of memory")])
+def test_too_little_memory_is_a_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], error: Exception) -> None:
+    def fail(*_: Any) -> bool:
+        raise error
+
+    monkeypatch.setattr(loop, "run", fail)
+    assert main(["--backend", "torch"]) == 2
+    [line] = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"train: error: there is not enough memory: {error}; use a smaller --size")
+
+
+def test_the_last_checkpoint_is_intact_only_where_there_is_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    record = {key: np.zeros((1, *shape), kind) for key, (shape, kind) in RECORD.items()}
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    with pytest.raises(UserError, match=f"{tmp_path} is full; there is no checkpoint yet"):
+        Replay(10, 2, tmp_path).add_batch(record)
+
+
+RECORD: dict[str, tuple[tuple[int, ...], Any]] = {
+    **dict.fromkeys(("is_first", "is_last", "is_terminal"), ((), np.bool_)),
+    **dict.fromkeys(("x", "action", "deter"), ((2,), np.float32)),
+    **{"reward": ((), np.float32), "stoch": ((2,), np.int32)},
+}
+
+
+def test_a_log_directory_that_is_no_text_is_refused(make: Make) -> None:
+    logdir = Path(os.fsdecode(os.fsencode(make().logdir) + b"\xff"))
+    with pytest.raises(UserError, match="is not UTF-8; choose another with --logdir"):
+        loop.run(make(logdir=logdir), FakeLearner)
+    assert not logdir.exists()

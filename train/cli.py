@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 
 from spec import built_profiles, hyperparameters, profiles, sizes
 from train.commands import COMMANDS
-from train.errors import UserError
+from train.errors import UserError, is_out_of_memory
 from train.options import DEFAULT_PRESET, NONFINITE, PROCESSES, RESUME, Options, make_options, presets
 from train.replay.layout import DETER_DTYPES
 
@@ -48,6 +48,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if error.details:
             print(error.details.rstrip(), file=sys.stderr)
         print(f"train: error: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except (MemoryError, RuntimeError) as error:
+        if not is_out_of_memory(error):
+            raise
+        remedy = "use a smaller --size, --batch-size, --image-size or --replay-memory, or fewer --envs"
+        print(f"train: error: there is not enough memory: {' '.join(str(error).split())[:300]}; {remedy}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         return 130

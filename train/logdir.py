@@ -24,6 +24,10 @@ def hold(logdir: Path, stack: ExitStack) -> None:
     """
     path = logdir / ".lock"
     try:
+        str(logdir).encode()
+    except UnicodeEncodeError as error:  # TensorBoard cannot write there.
+        raise UserError(f"the name of the log directory {str(logdir)!a} is not UTF-8; choose another with --logdir") from error
+    try:
         logdir.mkdir(parents=True, exist_ok=True)
         if os.path.lexists(path) and (path.is_symlink() or not path.is_file() or path.stat().st_size):
             raise UserError(f"{path} is not the lock of a run, which is an empty file: move it away, or choose another --logdir")

@@ -18,6 +18,7 @@ from train.cli import Parser
 from train.envs import Environments, Record, is_slow, make_env
 from train.errors import UserError, writing
 from train.evaluation import Agent, Episode, play_episodes, report_failures
+from train.files import replacing
 from train.logger import Display
 from train.options import Options
 from train.saved_agent import SavedAgent, agent_of
@@ -71,8 +72,8 @@ def main(arguments: Sequence[str]) -> int:
         run = {"checkpoint": str(checkpoint.path), "task": options.task, "step": saved.info["step"], "trained_by": saved.info["backend"]}
         run |= {"backend": options.backend, "device": learner.device, "seed": values.seed}
         lists = {"returns": [episode.score for episode in episodes], "lengths": [episode.length for episode in episodes]}
-        with writing(values.json):
-            values.json.write_text(json.dumps({**run, **summary, **lists}, indent=2) + "\n", encoding="utf-8")
+        with writing(values.json), replacing(values.json) as file:
+            file.write((json.dumps({**run, **summary, **lists}, indent=2) + "\n").encode())
     return 0
 
 
