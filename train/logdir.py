@@ -100,5 +100,5 @@ def _found(logdir: Path) -> list[Path]:
     checkpoints = [path for path in entries(logdir / "checkpoints") if re.fullmatch(r"[0-9]{12}(\.old|\.damaged(-[0-9]+)?)?", path.name)]
     incidents = [path for path in entries(logdir / "nonfinite") if re.fullmatch(r"[0-9]{12}", path.name)]
     pictures = [path for path in entries(logdir / "predictions") if re.fullmatch(r"[0-9]{12}-.+\.(png|gif)", path.name)]
-    buffer = [path for path in entries(logdir / "replay") if re.fullmatch(r"(chunk|journal|saved)-[0-9]{10}\.\w+", path.name)]
+    buffer = [path for path in entries(logdir / "replay") if re.fullmatch(r"(chunk|journal|saved)-[0-9]{10}\.(bin|safetensors)", path.name)]
     return [*(path for path in files if os.path.lexists(path)), *buffer, *checkpoints, *incidents, *pictures]

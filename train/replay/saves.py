@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
-from train.files import Unreadable, entries, open_file, reading, replacing
+from train.files import Unreadable, entries, free_name, open_file, reading, replacing
 from train.replay.chunks import chunk_numbers, chunk_path, disk_errors, next_number, numbers
 from train.replay.journal import Journal, journal_epochs, journal_path
 
@@ -151,8 +151,7 @@ def set_aside(directory: Path) -> Path:
     Raises:
       UserError: the disk refuses it.
     """
-    names = (directory / f"damaged{'' if number == 1 else f'-{number}'}" for number in range(1, 1000))
-    folder = next(path for path in names if not os.path.lexists(path))
+    folder = free_name(directory / "damaged")
     with disk_errors(directory):
         folder.mkdir()
         for file in buffer_files(directory):
