@@ -98,7 +98,7 @@ def misbehave(reply):
             "unknown dtype": reply.replace("float64", "float8"),
             "text": reply.partition(",")[0] + ', "result": "fine"}',
             "a list as kind": reply.partition(",")[0] + ', "error": {"kind": ["ValueError"], "message": "x"}}',
-            "long error": reply.partition(",")[0] + f', "error": {{"kind": "{"k" * LONG}", "message": "{"xyz12" * 2 * LONG}"}}}}',
+            "long error": reply.partition(",")[0] + f', "error": {{"kind": "{"k" * LONG}", "message": "{"x" * LONG}"}}}}',
             "long refusal": reply.partition(",")[0] + f', "error": {{"kind": "ValueError", "message": "{"x" * LONG}"}}}}',
             "many values": reply.partition(",")[0] + f', "result": [{"[]," * 300_000}[]]}}',
             "huge number": reply.partition(",")[0] + f', "result": {10**40}}}',

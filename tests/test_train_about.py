@@ -88,6 +88,8 @@ def test_a_damaged_run_json_does_not_stop_a_resume(tmp_path: Path, content: str)
     (tmp_path / "run.json").write_text(content)
     assert (read_about(tmp_path) is None) is ('"format": 1' not in content)
     assert len(write(make_options("jax", {"logdir": tmp_path}, {}), 10)["starts"]) == 1
+    if '"format": 1' not in content:
+        assert (tmp_path / "run.json.damaged").read_text() == content
 
 
 def test_run_json_is_complete_or_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

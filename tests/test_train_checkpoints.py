@@ -254,7 +254,7 @@ def test_a_damaged_checkpoint_falls_back_to_the_one_before(make: Make, name: str
     assert sum(len(stream["reward"]) for stream in stored(resumed)) == 120
 
 
-@pytest.mark.covers("LOOP-53")
+@pytest.mark.covers("LOOP-53", "REP-37")
 @pytest.mark.parametrize("which", ["newest", "all"])
 @pytest.mark.parametrize("damage", ["cut off", "a flipped bit", "missing"])
 def test_a_damaged_buffer_costs_no_checkpoint(make: Make, damage: str, which: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -4,6 +4,7 @@ import base64
 import hashlib
 import json
 import math
+import os
 import re
 from pathlib import Path
 from typing import Any
@@ -399,6 +400,35 @@ def test_more_groups_than_colours(tmp_path: Path) -> None:
     text = page(tmp_path)
     assert text.count('class="line c1"') == 1
     assert text.count('class="line c1 dashed"') == 1
+
+
+def test_what_is_no_file_is_noted_and_not_waited_for(tmp_path: Path) -> None:
+    """A pipe never ends, and neither does a device."""
+    path = full_run(tmp_path / "a", 0)
+    (path / "metrics.jsonl").unlink()
+    os.mkfifo(path / "metrics.jsonl")
+    os.mkfifo(path / "predictions" / "000000009999-pipe.png")
+    text = Document(page(path)).text
+    assert "there are no metrics: metrics.jsonl is not a file" in text
+    assert "000000009999-pipe.png cannot be read: 000000009999-pipe.png is not a file" in text
+    (path / "metrics.jsonl").unlink()
+    (path / "metrics.jsonl").mkdir()
+    assert "metrics.jsonl is not a file" in Document(page(path)).text
+
+
+def test_not_every_one_of_very_many_metrics_is_drawn(tmp_path: Path) -> None:
+    many = {f"m{index}": 1.0 for index in range(90_000)} | {f"train/loss/reconstruction/k{index}": 1.0 for index in range(1000)}
+    content = page(make_run(tmp_path / "a", [{"step": 1, **many}, {"step": 2, **many}]))
+    text = Document(content).text
+    assert "89,800 more metrics of this section are not drawn." in text
+    assert len(content) < 2_000_000
+
+
+def test_a_name_that_is_no_text_is_shown_as_far_as_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = Path(os.fsdecode(os.fsencode(tmp_path) + b"/r\xffn"))
+    full_run(path, 0)
+    assert main(["report", str(path), "--out", str(tmp_path / "all.html")]) == 0
+    assert "r?n" in (tmp_path / "all.html").read_text(encoding="utf-8")
 
 
 # The command

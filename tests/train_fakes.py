@@ -317,3 +317,13 @@ class Shrinking(Counting):
     def step(self, action: np.ndarray) -> Any:
         observation, reward, *_ = super().step(action)
         return observation, reward, self._time >= 10 - self.made, False, {}
+
+
+class Enormous(Counting):
+    """More classes than any machine can hold one-hot."""
+
+    observation_space = gym.Discrete(2**62)
+
+
+class EnormousActions(Counting):
+    action_space = gym.MultiDiscrete([2, 2**40])

@@ -3,6 +3,7 @@
 import dataclasses
 import datetime
 import json
+import os
 import secrets
 import shlex
 from collections.abc import Mapping
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from spec import Config, Spaces, built_profiles, load_config, sizes
 from train.errors import writing
-from train.files import read_json, replacing
+from train.files import free_name, read_json, replacing
 from train.machine import describe
 from train.options import Options, presets
 
@@ -45,7 +46,11 @@ def write_about(
     Raises:
       UserError: the disk refuses it.
     """
+    path = options.logdir / NAME
     earlier = (resumed_at is not None and read_about(options.logdir)) or {}
+    if resumed_at is not None and not earlier and os.path.lexists(path):  # Damaged, or of another program: the checkpoints are ours.
+        with writing(path):
+            path.rename(free_name(path.with_name(f"{NAME}.damaged")))
     profile, size, changed = nearest(options.config)
     machine = describe()
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
@@ -73,7 +78,7 @@ def write_about(
         "machine": machine,
         "starts": [*(starts if isinstance(starts, list) else []), start],
     }
-    return write_json(options.logdir / NAME, about)
+    return write_json(path, about)
 
 
 def read_about(logdir: Path) -> About | None:

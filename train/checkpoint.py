@@ -23,7 +23,20 @@ from safetensors import SafetensorError
 from safetensors.numpy import save_file
 
 from train.errors import UserError
-from train.files import SUMS, Arrays, Sealed, entries, flush, new_folder, open_sealed, reading, remove_folder, require_intact, seal
+from train.files import (
+    SUMS,
+    Arrays,
+    Sealed,
+    entries,
+    flush,
+    free_name,
+    new_folder,
+    open_sealed,
+    reading,
+    remove_folder,
+    require_intact,
+    seal,
+)
 from train.options import may_change
 
 FORMAT = 3
@@ -143,10 +156,8 @@ def set_aside(checkpoint: Path) -> Path:
     Raises:
       UserError: the disk refuses it.
     """
-    names = (f"{checkpoint.name}.damaged{'' if number == 1 else f'-{number}'}" for number in range(1, 1000))
-    aside = next(path for path in map(checkpoint.with_name, names) if not os.path.lexists(path))
     try:
-        return checkpoint.rename(aside)
+        return checkpoint.rename(free_name(checkpoint.with_name(f"{checkpoint.name}.damaged")))
     except OSError as error:
         raise UserError(f"cannot rename the damaged checkpoint {checkpoint}: {error.strerror}; remove it yourself") from error
 

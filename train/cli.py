@@ -17,7 +17,7 @@ from typing import Any, NoReturn
 from conformance.output import never_fail
 from spec import built_profiles, hyperparameters, profiles, sizes
 from train.commands import COMMANDS
-from train.errors import UserError
+from train.errors import UserError, is_out_of_memory
 from train.machine import own_version
 from train.options import (
     DEFAULT_PRESET,
@@ -66,6 +66,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return _run(sys.argv[1:] if arguments is None else arguments)
     except UserError as error:
         say_error(error)
+        return 2
+    except (MemoryError, RuntimeError) as error:
+        if not is_out_of_memory(error):
+            raise
+        remedy = "use a smaller --size, --batch-size, --image-size or --replay-memory, or fewer --envs"
+        print(f"train: error: there is not enough memory: {' '.join(str(error).split())[:300]}; {remedy}", file=sys.stderr)
         return 2
     except KeyboardInterrupt as error:
         print(f"train: interrupted {error}".rstrip(), file=sys.stderr)

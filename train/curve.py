@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 from train.errors import writing
+from train.files import replacing
 from train.logger import iterate_metrics
 
 BLUE, ORANGE, GRAY = "#2563eb", "#ea580c", "#6b7280"
@@ -53,8 +54,8 @@ def draw_curve(logdir: Path, title: str, random_return: float | None) -> Path:
     if axes.get_legend_handles_labels()[0]:
         axes.legend(frameon=False, fontsize=9)
     path = logdir / "curve.png"
-    with writing(path):
-        figure.savefig(path)
+    with writing(path), replacing(path) as file:
+        figure.savefig(file, format="png")
     return path
 
 

@@ -23,3 +23,9 @@ def writing(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise UserError(f"cannot write {path}: {error.strerror or error}") from error
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether NumPy, JAX or PyTorch could not get the memory that it asked for."""
+    words = ("resource_exhausted", "out of memory", "not enough memory", "can't allocate memory")
+    return isinstance(error, MemoryError) or any(word in str(error).lower() for word in words)

@@ -280,6 +280,15 @@ def new_folder(path: Path) -> Path:
     return folder
 
 
+def free_name(path: Path) -> Path:
+    """`path`, or what follows of path-2, path-3, ... that is not there yet."""
+    number, free = 1, path
+    while os.path.lexists(free):
+        number += 1
+        free = path.with_name(f"{path.name}-{number}")
+    return free
+
+
 def remove_folder(folder: Path, names: Sequence[str]) -> None:
     """Removes these files of a folder, and the folder if nothing else is in it. What others have put there stays.
 

@@ -11,7 +11,6 @@ import filelock
 from train.about import FORMAT, NAME, read_about, write_json
 from train.errors import UserError
 from train.files import entries
-from train.replay.saves import buffer_files
 
 MARK = "has_checkpoint"
 MOST_NAMES = 5
@@ -25,9 +24,16 @@ def hold(logdir: Path, stack: ExitStack) -> None:
     """
     path = logdir / ".lock"
     try:
+        str(logdir).encode()
+    except UnicodeEncodeError as error:  # TensorBoard cannot write there.
+        raise UserError(f"the name of the log directory {str(logdir)!a} is not UTF-8; choose another with --logdir") from error
+    try:
         logdir.mkdir(parents=True, exist_ok=True)
         if os.path.lexists(path) and (path.is_symlink() or not path.is_file() or path.stat().st_size):
             raise UserError(f"{path} is not the lock of a run, which is an empty file: move it away, or choose another --logdir")
+        log = logdir / "metrics.jsonl"
+        if os.path.lexists(log) and (log.is_symlink() or not log.is_file()):
+            raise UserError(f"{log} is no file of a run, but a link, a directory or a device: move it away, or choose another --logdir")
         lock = filelock.FileLock(path, timeout=0)
         try:
             lock.acquire()
@@ -91,7 +97,8 @@ def note_first_checkpoint(logdir: Path) -> None:
 def _found(logdir: Path) -> list[Path]:
     """What lies under the names of files that a run replaces, cuts or deletes. Other files are no obstacle."""
     files = [logdir / name for name in (NAME, "metrics.jsonl", "curve.png")]
-    checkpoints = [path for path in entries(logdir / "checkpoints") if re.fullmatch(r"[0-9]{12}(\..*)?", path.name)]
+    checkpoints = [path for path in entries(logdir / "checkpoints") if re.fullmatch(r"[0-9]{12}(\.old|\.damaged(-[0-9]+)?)?", path.name)]
     incidents = [path for path in entries(logdir / "nonfinite") if re.fullmatch(r"[0-9]{12}", path.name)]
     pictures = [path for path in entries(logdir / "predictions") if re.fullmatch(r"[0-9]{12}-.+\.(png|gif)", path.name)]
-    return [*(path for path in files if os.path.lexists(path)), *buffer_files(logdir / "replay"), *checkpoints, *incidents, *pictures]
+    buffer = [path for path in entries(logdir / "replay") if re.fullmatch(r"(chunk|journal|saved)-[0-9]{10}\.(bin|safetensors)", path.name)]
+    return [*(path for path in files if os.path.lexists(path)), *buffer, *checkpoints, *incidents, *pictures]

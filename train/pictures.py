@@ -64,7 +64,7 @@ def draw_predictions(
 
 def prune_pictures(directory: Path, step: int) -> None:
     """Removes all pictures but those of the newest `KEPT` evaluations up to `step`; later ones are from before a resume."""
-    pictures = {path: path.name[:12] for path in directory.iterdir() if re.fullmatch(r"\d{12}-.+\.(png|gif)", path.name)}
+    pictures = {path: path.name[:12] for path in directory.iterdir() if re.fullmatch(r"[0-9]{12}-.+\.(png|gif)", path.name)}
     kept = sorted({name for name in pictures.values() if int(name) <= step})[-KEPT:]
     for path, name in pictures.items():
         if name not in kept:

@@ -22,6 +22,7 @@ from train.errors import UserError
 from train.evaluation import play_randomly, report_failure
 from train.forecast import say_memory
 from train.logger import Display, Logger
+from train.machine import describe
 from train.options import Options
 from train.outcome import mean_of
 from train.replay import Prefetcher, Replay, erase
@@ -31,6 +32,8 @@ from train.warm_start import begin_from, require_same_origin
 
 if TYPE_CHECKING:
     from conformance.preflight import Report
+
+FITS = 2.0  # GiB that every machine has
 
 
 def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -> Run:
@@ -209,10 +212,19 @@ def _make_environments(options: Options, display: Display, stack: ExitStack) -> 
 
 def _count_parameters(options: Options, spaces: Spaces) -> int:
     try:
-        return sum(math.prod(parameter.shape) for parameter in parameter_table(options.config, spaces).values())
+        count = sum(math.prod(parameter.shape) for parameter in parameter_table(options.config, spaces).values())
     except ValueError as error:
         remedy = " (--image-size)" if spaces.images else ""
         raise UserError(f"task {options.task}: {error}{remedy}") from error
+    needed = 16 * count / 2**30  # parameters, two moments and gradients
+    memory = describe()["memory_gib"] if needed > FITS else None
+    if isinstance(memory, float) and needed > memory:
+        sizes = {key: space.encoded_size for key, space in (*spaces.vectors.items(), *spaces.actions.items())}
+        largest = f", or describe {max(sizes, key=lambda key: sizes[key])!r} by fewer numbers" if sizes else ""
+        raise UserError(
+            f"{count:,} parameters take {needed:,.3g} GiB for training, and this machine has {memory:g}: choose a smaller --size{largest}"
+        )
+    return count
 
 
 def _preflight(options: Options, spaces: Spaces, display: Display) -> "Report":

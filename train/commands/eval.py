@@ -18,6 +18,7 @@ from train.cli import BACKENDS, Parser
 from train.envs import ContractEnv, Environments, Record, make_env, try_out
 from train.errors import UserError, writing
 from train.evaluation import Agent, Episode, play_episodes, report_failure, report_failures
+from train.files import replacing
 from train.logger import Display
 from train.options import Options, names_code
 from train.saved_agent import SavedAgent, agent_of
@@ -81,8 +82,8 @@ def main(arguments: Sequence[str]) -> int:
         run = {"checkpoint": str(checkpoint.path), "task": options.task, "step": saved.info["step"], "trained_by": saved.info["backend"]}
         run |= {"backend": options.backend, "device": learner.device, "seed": values.seed, "mode": values.mode}
         lists = {"returns": [episode.score for episode in episodes], "lengths": [episode.length for episode in episodes]}
-        with writing(values.json):
-            values.json.write_text(json.dumps({**run, **summary, **lists}, indent=2) + "\n", encoding="utf-8")
+        with writing(values.json), replacing(values.json) as file:
+            file.write((json.dumps({**run, **summary, **lists}, indent=2) + "\n").encode())
     return 0
 
 

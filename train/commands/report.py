@@ -1,12 +1,12 @@
 """`train report`: one HTML page about one run or many."""
 
-import os
 import time
 from collections.abc import Sequence
 from pathlib import Path
 
 from train.cli import Parser
 from train.errors import UserError
+from train.files import replacing
 from train.report.page import render
 from train.report.runs import find_logdirs, read_run
 
@@ -26,11 +26,10 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--out", type=Path, default=Path("report.html"), metavar="FILE", help="the page (default report.html)")
     options = parser.parse_args(arguments)
     runs = [read_run(logdir) for logdir in find_logdirs(options.logdirs)]
-    page = render(runs, time.time()).encode()
-    temporary = options.out.with_name(f"{options.out.name}.tmp")
+    page = render(runs, time.time()).encode("utf-8", "replace")  # The name of a log directory need not be text.
     try:
-        temporary.write_bytes(page)
-        os.replace(temporary, options.out)
+        with replacing(options.out) as file:
+            file.write(page)
     except OSError as error:
         raise UserError(f"cannot write {options.out}: {error.strerror}; choose another file with --out") from error
     print(f"{options.out}: {len(runs)} {'run' if len(runs) == 1 else 'runs'}, {len(page) / 1000:,.0f} kB")

@@ -24,6 +24,8 @@ from train.errors import UserError
 
 Path = tuple[str, ...]
 
+MOST_NUMBERS = 2**20  # that one observation or action may become
+
 
 @dataclasses.dataclass(frozen=True)
 class Translation:
@@ -73,6 +75,13 @@ def translate(observation_space: gym.Space[Any], action_space: gym.Space[Any], i
         )
     except ValueError as error:
         raise UserError(f"unsupported spaces: {error}") from error
+    for kind, entries in (("observation", spaces.vectors), ("action", spaces.actions)):
+        for key, entry in entries.items():
+            if entry.encoded_size > MOST_NUMBERS:  # Before anything is allocated for it.
+                raise UserError(
+                    f"the {kind} {key!r} becomes {entry.encoded_size:,} numbers; expected at most {MOST_NUMBERS:,}: describe it by fewer, "
+                    "such as the digits of a number or its features, with a wrapper of your own"
+                )
     return Translation(spaces, observations, actions)
 
 
@@ -83,7 +92,7 @@ def random_actions(spaces: Spaces, rng: np.random.Generator, count: int) -> np.n
         if isinstance(space, Vector):
             parts.append(rng.uniform(-1.0, 1.0, (count, space.size)))
         else:
-            parts += [np.eye(classes)[rng.integers(classes, size=count)] for classes in space.classes]
+            parts += [rng.integers(classes, size=count)[:, None] == np.arange(classes) for classes in space.classes]
     return np.concatenate(parts, axis=1, dtype=np.float32)
 
 

@@ -69,10 +69,11 @@ class Replay:
         if directory is None:
             directory = Path(tempfile.mkdtemp(prefix="replay-"))
             weakref.finalize(self, shutil.rmtree, directory, ignore_errors=True)
-        with disk_errors(directory):
-            directory.mkdir(parents=True, exist_ok=True)
-        if buffer_files(directory) and not restoring:
-            raise ValueError(f"{directory} holds a replay buffer already: restore it, or erase it first")
+        if not restoring:
+            with disk_errors(directory):
+                directory.mkdir(parents=True, exist_ok=True)
+            if buffer_files(directory):
+                raise ValueError(f"{directory} holds a replay buffer already: restore it, or erase it first")
         self.directory = directory
         self.lock = threading.RLock()
         self.warnings: list[str] = []

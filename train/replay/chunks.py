@@ -30,6 +30,7 @@ from train.replay.layout import Layout, Sections
 PAGE = 4096
 MAGIC = "dreamer-spec replay chunk"
 FORMAT = 1
+CHUNK = "chunk-"
 SPARE = 32  # files that wait to be used again
 
 
@@ -231,12 +232,18 @@ class ChunkStore:
 
 
 def chunk_path(directory: Path, number: int) -> Path:
-    return directory / f"chunk-{number:010d}.bin"
+    return directory / f"{CHUNK}{number:010d}.bin"
 
 
 def chunk_numbers(directory: Path) -> list[int]:
     """The numbers of all chunk files of a directory, and of no other file: [REP-36]."""
-    return [number for number in numbers(directory, "chunk-", ".bin") if is_chunk(chunk_path(directory, number))]
+    return [number for number in numbers(directory, CHUNK, ".bin") if is_chunk(chunk_path(directory, number))]
+
+
+def next_number(directory: Path) -> int:
+    """Of a chunk: beyond all that are in a directory, whoever put them there."""
+    found = [match for path in entries(directory) if (match := re.fullmatch(rf"{CHUNK}([0-9]{{10}})\.bin", path.name))]
+    return max((int(match[1]) for match in found), default=-1) + 1
 
 
 def numbers(directory: Path, prefix: str, suffix: str) -> list[int]:

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
-from train.files import Unreadable, entries, open_file, reading, replacing
-from train.replay.chunks import chunk_numbers, chunk_path, disk_errors, numbers
+from train.files import Unreadable, entries, free_name, open_file, reading, replacing
+from train.replay.chunks import chunk_numbers, chunk_path, disk_errors, next_number, numbers
 from train.replay.journal import Journal, journal_epochs, journal_path
 
 FORMAT = 1
@@ -119,9 +119,8 @@ class History:
         for path in entries(self.directory):
             if _UNFINISHED.fullmatch(path.name):  # A process was killed while it wrote it.
                 path.unlink(missing_ok=True)
-        present = chunk_numbers(self.directory)
-        self.next_chunk = max([*present, *chunks], default=-1) + 1
-        for chunk in present:
+        self.next_chunk = max([next_number(self.directory), *(chunk + 1 for chunk in chunks)])
+        for chunk in chunk_numbers(self.directory):
             if chunk not in needed and self.retire(chunk):
                 chunk_path(self.directory, chunk).unlink()
 
@@ -152,8 +151,7 @@ def set_aside(directory: Path) -> Path:
     Raises:
       UserError: the disk refuses it.
     """
-    names = (directory / f"damaged{'' if number == 1 else f'-{number}'}" for number in range(1, 1000))
-    folder = next(path for path in names if not os.path.lexists(path))
+    folder = free_name(directory / "damaged")
     with disk_errors(directory):
         folder.mkdir()
         for file in buffer_files(directory):

@@ -37,11 +37,18 @@ def _section(entries: dict) -> Section:
     return Section(title, about, tuple(Metric(name, **entry) for name, entry in entries.items()))
 
 
+@functools.cache
+def _patterns() -> list[tuple[re.Pattern[str], str, Metric]]:
+    """The longest names first: <key>_context_error is not the <key>_error of a longer key."""
+    found = [(section, metric) for section, content in sections().items() for metric in content.metrics]
+    found.sort(key=lambda entry: -len(entry[1].name))
+    return [(re.compile(re.escape(metric.name).replace("<key>", ".+"), re.DOTALL), section, metric) for section, metric in found]
+
+
+@functools.lru_cache(maxsize=10_000)
 def find(name: str) -> tuple[str, Metric] | None:
     """The section and the entry of a metric as it stands in metrics.jsonl; None if nobody has described it."""
-    entries = ((section, metric) for section, content in sections().items() for metric in content.metrics)
-    found = [entry for entry in entries if re.fullmatch(re.escape(entry[1].name).replace("<key>", ".+"), name)]
-    return max(found, key=lambda entry: len(entry[1].name), default=None)  # <key>_context_error is not the <key>_error of a longer key
+    return next(((section, metric) for pattern, section, metric in _patterns() if pattern.fullmatch(name)), None)
 
 
 def markdown() -> str:

@@ -16,6 +16,7 @@ from train.report.svg import LARGE, SMALL, Series, line_chart, stacked_chart, va
 SMOOTH, FINE = 50, 100  # stretches of a curve: for the noisy returns, and for other metrics
 EPISODES_EACH = 5  # on average in a stretch at least
 OTHER = "other"
+MOST = 200  # metrics of a section that are drawn
 TIME_COLORS = {"train": 0, "environments": 1, "policy": 2, "replay": 4, "evaluation": 3, "checkpoint": 5, "log": 7, "other": 6}
 
 EPISODE, EVALUATION, ERROR, RANDOM = "episode/return", "evaluation/return", "evaluation/return_standard_error", "random/return"
@@ -130,17 +131,20 @@ def _metric_sections(groups: Sequence[Group], end: float) -> list[str]:
     names = dict.fromkeys(name for group in groups for run in group.runs for name in run.curves if name not in ABOVE)
     order = [metric.name for section in sections().values() for metric in section.metrics]
     chosen: dict[str, list[str]] = {section: [] for section in [*sections(), OTHER]}
-    for name in sorted(names, key=lambda name: order.index(entry[1].name) if (entry := find(name)) else len(order)):
-        entry = find(name)
+    rank = {name: index for index, name in enumerate(order)}
+    found = {name: find(name) for name in names}
+    for name, entry in sorted(found.items(), key=lambda item: rank[item[1][1].name] if item[1] else len(rank)):
         chosen[entry[0] if entry else OTHER].append(name)
     parts = []
     for section, members in chosen.items():
         if not members:
             continue
+        left_out, members = len(members) - MOST, members[:MOST]
         content = _time_split(groups, members, end) if section == "time" else _tiles(groups, members, end)
         title = sections()[section].title if section in sections() else "Other metrics"
         about = f'<p class="small muted">{_prose(sections()[section].about)}</p>' if section in sections() else ""
-        parts.append(f"<h3>{escape(title)}</h3>{about}{content}")
+        more = f"<p>{left_out:,} more metrics of this section are not drawn.</p>" if left_out > 0 else ""
+        parts.append(f"<h3>{escape(title)}</h3>{about}{content}{more}")
     return parts
 
 

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from html import escape
 from pathlib import Path
 
+from train.files import Unreadable, open_file, reading
 from train.report.charts import task_section
 from train.report.html import cell, details, table
 from train.report.results import result_cards, result_table
@@ -176,11 +177,12 @@ def _picture(run: RunLog, path: Path) -> str:
 def _embedded(path: Path, label: str) -> str:
     """The picture inside the page, or a line that says why not."""
     try:
-        if path.stat().st_size > LARGEST_PICTURE:
-            return f'<p class="muted">{escape(path.name)} is larger than {LARGEST_PICTURE / 2**20:.0f} MiB and stays outside.</p>'
-        content = path.read_bytes()
-    except OSError as error:
-        return f'<p class="fail">{escape(path.name)} cannot be read: {escape(str(error.strerror))}.</p>'
+        with open_file(path) as file, reading(path):
+            content = file.read(LARGEST_PICTURE + 1)
+    except (FileNotFoundError, ValueError, Unreadable) as error:
+        return f'<p class="fail">{escape(path.name)} cannot be read: {escape(str(error))}.</p>'
+    if len(content) > LARGEST_PICTURE:
+        return f'<p class="muted">{escape(path.name)} is larger than {LARGEST_PICTURE / 2**20:.0f} MiB and stays outside.</p>'
     kind = next((kind for start, kind in KINDS.items() if content.startswith(start)), None)
     if kind is None:
         return f'<p class="fail">{escape(path.name)} is damaged: neither PNG nor GIF.</p>'

@@ -11,7 +11,7 @@ import numpy as np
 
 from train.about import read_about
 from train.errors import UserError
-from train.files import SUMS, read_json
+from train.files import SUMS, Unreadable, entries, read_json
 from train.logger import iterate_metrics
 
 # Of the options, beside task, backend and hyperparameters, those that change what is learned: runs of one group agree in all of them.
@@ -133,12 +133,16 @@ def read_run(logdir: Path) -> RunLog:
         about = _from_checkpoint(logdir)
         known = "what the newest checkpoint knows" if about else "nothing"
         notes.append(f"run.json is {'damaged' if (logdir / 'run.json').exists() else 'missing'}: shown is {known}")
+    curves: dict[str, Curve] = {}
+    seconds, damaged, written = 0.0, 0, None
     try:
         curves, seconds, damaged = _read_curves(logdir / "metrics.jsonl")
         written = (logdir / "metrics.jsonl").stat().st_mtime if (logdir / "metrics.jsonl").exists() else None
-        pictures = newest_pictures(logdir / "predictions")
+    except ValueError as error:
+        notes.append(f"there are no metrics: {error}")
     except OSError as error:
         raise UserError(f"cannot read the run in {logdir}: {error}") from error
+    pictures = newest_pictures(logdir / "predictions")
     if damaged:
         notes.append(
             f"metrics.jsonl has {damaged:,} damaged {'line' if damaged == 1 else 'lines'}, which {'is' if damaged == 1 else 'are'} left out"
@@ -168,7 +172,7 @@ def _of(about: dict[str, Any], name: str, kind: type) -> Any:
 
 
 def _checkpoints(logdir: Path) -> list[Path]:
-    return sorted(path for path in (logdir / "checkpoints").glob("*") if path.name.isascii() and path.name.isdigit())
+    return sorted(path for path in entries(logdir / "checkpoints") if path.name.isascii() and path.name.isdigit())
 
 
 def _from_checkpoint(logdir: Path) -> dict[str, Any]:
@@ -180,7 +184,7 @@ def _from_checkpoint(logdir: Path) -> dict[str, Any]:
             options = {name: identity.pop(name) for name in ("task", "seed", *LEARNING_OPTIONS) if name in identity}
             about = {"task": options.pop("task", ""), "backend": info.get("backend"), "spaces": info.get("spaces")}
             return about | {"options": options, "hyperparameters": identity}
-        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, Unreadable):
             continue
     return {}
 
@@ -210,7 +214,7 @@ def _curve(steps: "array.array[float]", values: "array.array[float]") -> Curve:
 def newest_pictures(directory: Path) -> list[Path]:
     """The PNG and GIF files of the newest step of each key: <step>-<key>.png and .gif."""
     newest: dict[tuple[str, str], Path] = {}
-    for path in sorted(directory.glob("*")):
+    for path in entries(directory):
         step, separator, key = path.stem.partition("-")
         if path.suffix in (".png", ".gif") and separator and step.isascii() and step.isdigit():
             newest[key, path.suffix] = path
