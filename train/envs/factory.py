@@ -65,6 +65,10 @@ def _make_gymnasium(task: str, name: str, render: bool) -> gymnasium.Env[Any, An
         raise UserError(f"task {task} needs the package {error.name}: {_gymnasium_extra(name) or 'install it with pip'}") from error
     except gymnasium.error.Error as error:
         raise UserError(f"unknown task {task!r}: {error}") from error
+    except RuntimeError as error:
+        if "MUJOCO_GL" not in str(error):  # What MuJoCo says of a value that it does not know.
+            raise
+        raise UserError(f"task {task}: {error}; set it to egl, osmesa or disabled, or unset it") from error
 
 
 def _gymnasium_extra(name: str) -> str:
@@ -75,17 +79,13 @@ def _gymnasium_extra(name: str) -> str:
 
 
 def _make_dm_control(task: str, name: str, vision: bool, image_size: int, render: bool) -> gymnasium.Env[Any, Any]:
-    adapter = _import("train.envs.dm_control", "dm-control", task)
-    adapter.choose_renderer(vision or render)
-    try:
-        _import("dm_control.suite", "dm-control", task)
-    except (ImportError, AttributeError, RuntimeError) as error:  # What a missing graphics library looks like.
-        raise UserError(
-            f"task {task}: dm_control cannot render ({error}); install EGL (Debian: libegl1 libgl1) or OSMesa (libosmesa6), "
-            "and set MUJOCO_GL to egl or osmesa"
-        ) from error
     domain, _, control_task = name.partition("-")
-    return adapter.make(task, domain, control_task, image_size if vision else None)
+    try:
+        adapter = importlib.import_module("train.envs.dm_control")
+        env: gymnasium.Env[Any, Any] = adapter.make(task, domain, control_task, image_size if vision else None, render)
+    except ModuleNotFoundError as error:
+        raise UserError(f"task {task} needs the package {error.name}: {_pip('dm-control')}") from error
+    return env
 
 
 def _make_own(task: str, module_name: str, name: str, render: bool) -> gymnasium.Env[Any, Any]:
