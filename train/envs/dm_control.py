@@ -4,6 +4,7 @@ Why not through Shimmy: its module imports interactive viewers and their package
 """
 
 import importlib
+import math
 import os
 import sys
 from typing import Any
@@ -19,9 +20,9 @@ CAMERAS = {"quadruped": 2}  # D-109; camera 0 elsewhere
 GLFW = ("glfw", "on", "enable", "enabled", "true", "1")  # its names as values of MUJOCO_GL
 
 
-def make(task: str, domain: str, name: str, image_size: int | None, renders: bool) -> gymnasium.Env[Any, Any]:
+def make(task: str, domain: str, name: str, image_size: int | None, renders: bool, limited: bool = True) -> gymnasium.Env[Any, Any]:
     """The task `name` of `domain`; from vectors, or where image_size is given from images only. renders: whether it can be rendered;
-    from images always.
+    from images always. limited: whether the suite's time limit holds.
 
     Raises:
       UserError: no such task, or this machine cannot render.
@@ -33,7 +34,7 @@ def make(task: str, domain: str, name: str, image_size: int | None, renders: boo
         known = ", ".join(sorted("-".join(entry) for entry in suite.ALL_TASKS if domain in ("", entry[0])))
         remedy = f"known: {known}" if known else f"known domains: {', '.join(sorted({entry[0] for entry in suite.ALL_TASKS}))}"
         raise UserError(f"unknown task {task!r}; {remedy}")
-    env = suite.load(domain, name)
+    env = suite.load(domain, name, task_kwargs=None if limited else {"time_limit": math.inf})
     if renders:
         _require_rendering(task, env.physics)
     else:
