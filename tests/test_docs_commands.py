@@ -88,7 +88,9 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "my_dreamer.py").write_text("from reference_numpy import returns, transforms\n\nlosses = transforms\n")
     with (folder / "my_dreamer.py").open("a") as file:
         file.write("losses.lambda_return = returns.lambda_return\n")
-    (folder / "my_module.py").write_text("import gymnasium\n\n\ndef make_env():\n    return gymnasium.make('CartPole-v1')\n")
+    (folder / "my_module.py").write_text(
+        "import gymnasium\n\n\ndef make_env(level=1, goals=()):\n    return gymnasium.make('CartPole-v1')\n"
+    )
     (folder / "expected.toml").write_text("")
     (folder / "bin").mkdir()
     serve = f'#!/bin/sh\nexec "{sys.executable}" -m conformance.serve my_adapter.py\n'

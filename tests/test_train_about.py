@@ -41,7 +41,8 @@ def test_the_command_gives_every_option() -> None:
             continue
         words.append(action.option_strings[-1])  # --no-preflight of --preflight
         if action.nargs != 0:
-            unusual = [choice for choice in action.choices or ["7"] if choice != getattr(plain, action.dest, "12m")]
+            seven = "n=7" if action.dest == "env_arg" else "7"
+            unusual = [choice for choice in action.choices or [seven] if choice != getattr(plain, action.dest, "12m")]
             words.append(unusual[-1])
     options = parse(words)
     same = [field.name for field in dataclasses.fields(options) if getattr(options, field.name) == getattr(plain, field.name)]

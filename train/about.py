@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from spec import Config, Spaces, built_profiles, load_config, sizes
+from train import arguments as keywords
 from train.errors import writing
 from train.files import free_name, read_json, replacing
 from train.machine import describe
@@ -113,13 +114,14 @@ def command_line(options: Options) -> list[str]:
     words = ["train", "--backend", options.backend, "--task", options.task, "--profile", profile, "--size", size]
     for field in dataclasses.fields(options):
         value = getattr(options, field.name)
-        if field.name in ("backend", "task", "config") or value == defaults[field.name]:
+        if field.name in ("backend", "task", "config", "env_arg") or value == defaults[field.name]:
             continue
         flag = field.name.rstrip("_").replace("_", "-")
         if isinstance(value, bool):
             words.append(f"--{flag}" if value else f"--no-{flag}")
         else:
             words += [f"--{flag}", str(value)]
+    words += [word for argument in keywords.write(options.env_arg) for word in ("--env-arg", argument)]
     for name, value in changed.items():
         words += [f"--{name.replace('_', '-')}", _show(value)]
     return words

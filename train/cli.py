@@ -16,6 +16,7 @@ from typing import Any, NoReturn
 
 from conformance.output import never_fail
 from spec import built_profiles, hyperparameters, profiles, sizes
+from train import arguments as keywords
 from train.commands import COMMANDS
 from train.errors import UserError, is_out_of_memory
 from train.machine import own_version
@@ -138,6 +139,8 @@ def options_of(values: Mapping[str, Any]) -> Options:
       UserError: a value that no run could have.
     """
     given = {name: value for name, value in values.items() if value is not None}
+    if "env_arg" in given:
+        given["env_arg"] = keywords.join(given["env_arg"])
     backend, preset = given.pop("backend"), given.pop("preset", None)
     overrides = {name: given.pop(name) for name in hyperparameters() if name in given}
     return make_options(backend, given, overrides, preset)
@@ -212,6 +215,19 @@ def add_options(parser: argparse.ArgumentParser, begins: bool = True) -> None:
     run.add_argument("--wandb", metavar="PROJECT", help="log to Weights & Biases too (pip install 'dreamer-spec[wandb]')")
 
     envs = parser.add_argument_group("environments")
+    envs.add_argument(
+        "--env-arg",
+        type=keywords.read,
+        action="append",
+        metavar="NAME=VALUE",
+        help="keyword argument of a Gymnasium id or a CALLABLE, the value as JSON or else as text; one option for each",
+    )
+    envs.add_argument(
+        "--time-limit",
+        type=_whole(1),
+        metavar="N",
+        help="steps of the environment, before action repeat, that truncate an episode (default: the suite's limit)",
+    )
     envs.add_argument("--action-repeat", type=_whole(1), metavar="N", help="apply each action N times (default 1)")
     envs.add_argument("--image-size", type=_whole(1), metavar="N", help="side to which images are resized, in pixels (default 64)")
     envs.add_argument("--processes", choices=PROCESSES, help="one process per environment; auto: if its steps are slow (default)")

@@ -1,7 +1,6 @@
 """What a run will need, said before it does: memory and disk before training, time after the first train steps."""
 
 import math
-import os
 import shutil
 import time
 from collections.abc import Callable, Iterator
@@ -12,6 +11,7 @@ import numpy as np
 from spec import Discrete, Image, Spaces
 from train import cgroups
 from train.logger import duration
+from train.machine import physical_memory
 from train.options import Options
 from train.replay.layout import TYPES, Layout
 from train.state import Run
@@ -58,11 +58,8 @@ def _dtype(space: Any) -> type[np.generic]:
 
 def machine_memory() -> int | None:
     """Bytes that this machine, or the container, gives; None where the system does not say."""
-    try:
-        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, ValueError, OSError):  # Windows
-        return None
-    return min([memory, *cgroups.memory_limits()])
+    memory = physical_memory()
+    return None if memory is None else min([memory, *cgroups.memory_limits()])
 
 
 def size(count: float) -> str:

@@ -16,10 +16,11 @@ ROOT = Path(__file__).resolve().parent.parent
 
 def describe() -> dict[str, object]:
     """Processor, cores, memory, accelerator, operating system, versions and the commit, in plain JSON types."""
+    memory = physical_memory()
     return {
         "processor": _processor(),
         "cores": os.cpu_count(),
-        "memory_gib": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1),
+        "memory_gib": None if memory is None else round(memory / 2**30, 1),
         "accelerator": accelerator(),
         "system": platform.platform(),
         "python": platform.python_version(),
@@ -27,6 +28,14 @@ def describe() -> dict[str, object]:
         "commit": _commit(),
         "date": time.strftime("%Y-%m-%d"),
     }
+
+
+def physical_memory() -> int | None:
+    """Bytes; None where the system does not say (Windows)."""
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError, OSError):
+        return None
 
 
 def accelerator() -> str | None:

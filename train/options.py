@@ -27,7 +27,8 @@ class Options:
     """Everything that a run depends on, beside the code.
 
     steps and eval_every are environment steps: records times action_repeat. checkpoint_every, log_every and env_timeout are seconds.
-    replay_memory is in GiB. from_: a log directory or a checkpoint, whose parameters a new run begins with.
+    replay_memory is in GiB. env_arg: keyword arguments of the environment. time_limit: in frames, that is before action repeat. from_: a
+    log directory or a checkpoint, whose parameters a new run begins with.
     """
 
     backend: str
@@ -39,6 +40,8 @@ class Options:
     seed: int = 0
     device: str | None = None
     threads: int | None = None
+    env_arg: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    time_limit: int | None = None
     action_repeat: int = 1
     image_size: int = 64
     eval_every: int = 0
@@ -63,7 +66,8 @@ class Options:
 
     def identity(self) -> dict[str, Any]:
         """What was learned depends on, the backend aside: either continues what the other began. See `may_change`."""
-        run = {name: getattr(self, name) for name in ("task", "seed", "action_repeat", "image_size", "replay_deter")}
+        run = {name: getattr(self, name) for name in ("task", "time_limit", "seed", "action_repeat", "image_size", "replay_deter")}
+        run["env_arg"] = dict(self.env_arg) or None
         config = {name: list(value) if isinstance(value, tuple) else value for name, value in dataclasses.asdict(self.config).items()}
         return run | config
 

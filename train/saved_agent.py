@@ -9,12 +9,22 @@ import numpy as np
 
 from reference_numpy.shapes import require_shape
 from spec import Config, Parameter, Spaces, hyperparameters, load_config, parameter_table
+from train.arguments import check as check_keywords
 from train.checkpoint import Checkpoint
 from train.errors import UserError
 from train.files import Arrays
 from train.machine import own_version
 
-INFO = {"task": str, "step": int, "backend": str, "action_repeat": int, "image_size": int, "source": dict, "versions": dict}
+INFO = {
+    "task": str,
+    "step": int,
+    "backend": str,
+    "action_repeat": int,
+    "image_size": int,
+    "env_arg": dict,
+    "source": dict,
+    "versions": dict,
+}
 MOST_LAYERS = 1000  # of a network: no description is believed that would need more memory than the parameters
 
 
@@ -41,6 +51,7 @@ def agent_of(checkpoint: Checkpoint) -> SavedAgent:
         config = config_from_json({name: identity[name] for name in hyperparameters() if name in identity})
         spaces = Spaces.from_json(checkpoint.info.get("spaces"))
         info: dict[str, Any] = {name: identity.get(name) for name in ("task", "action_repeat", "image_size")}
+        info |= {"env_arg": identity.get("env_arg") or {}, "time_limit": identity.get("time_limit")}
         info |= {"step": counters.get("records"), "backend": checkpoint.info.get("backend"), "versions": versions()}
         info["source"] = {"checkpoint": str(checkpoint.path), "seed": identity.get("seed"), "train_steps": counters.get("train_steps")}
         check_info(info, spaces)
@@ -78,6 +89,10 @@ def check_info(info: Mapping[str, Any], spaces: Spaces) -> None:
             raise ValueError(f"expected a {kind.__name__} as {name}, got {info.get(name)!r:.80}")
     if not info["task"].isprintable():
         raise ValueError(f"the task {info['task']!r:.80} holds characters that cannot be printed")
+    check_keywords(info.get("env_arg"))
+    time_limit = info.get("time_limit")
+    if time_limit is not None and (type(time_limit) is not int or time_limit < 1):
+        raise ValueError(f"time_limit is {time_limit!r:.80}; expected null or a whole number of at least 1")
     for name, least in (("step", 0), ("action_repeat", 1), ("image_size", 1)):
         if info[name] < least:
             raise ValueError(f"{name} is {info[name]}; expected at least {least}")

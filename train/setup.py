@@ -191,6 +191,8 @@ def _make_environments(options: Options, display: Display, stack: ExitStack) -> 
         image_size=options.image_size,
         action_repeat=options.action_repeat,
         info_metrics=names_of(options.info_metrics),
+        arguments=options.env_arg,
+        time_limit=options.time_limit,
     )
     trial = None
     if options.processes != "no":

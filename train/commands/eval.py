@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from reference_numpy.training_loop import derive_seed
+from train import arguments as keywords
 from train.backend import Learner
 from train.checkpoint import open_checkpoint
 from train.cli import BACKENDS, Parser
@@ -40,9 +41,13 @@ def main(arguments: Sequence[str]) -> int:
     values = _parse(arguments)
     checkpoint = open_checkpoint(values.checkpoint)
     saved = agent_of(checkpoint)  # Before a learner is made: it has looked at the sizes.
+    task = values.task or _task_without_code(saved)
+    same = saved.info if task == saved.info["task"] else {}  # Another task has arguments of its own.
     options = Options(
         backend=values.backend or _trained_last(saved),
-        task=values.task or _task_without_code(saved),
+        task=task,
+        env_arg={**same.get("env_arg", {}), **keywords.join(values.env_arg or [])},
+        time_limit=values.time_limit or same.get("time_limit"),
         config=saved.config,
         logdir=checkpoint.path,
         steps=0,
@@ -54,7 +59,13 @@ def main(arguments: Sequence[str]) -> int:
     learner_type = import_learner(options.backend)
     film = Film(values.video) if values.video else None
     make: Callable[[int], ContractEnv] = functools.partial(
-        make_env, options.task, image_size=options.image_size, action_repeat=options.action_repeat, render=film is not None
+        make_env,
+        options.task,
+        image_size=options.image_size,
+        action_repeat=options.action_repeat,
+        render=film is not None,
+        arguments=options.env_arg,
+        time_limit=options.time_limit,
     )
     make = film.filming(make) if film else make
     count = min(saved.config.envs, values.episodes)
@@ -80,6 +91,7 @@ def main(arguments: Sequence[str]) -> int:
         print(film.save())
     if values.json:
         run = {"checkpoint": str(checkpoint.path), "task": options.task, "step": saved.info["step"], "trained_by": saved.info["backend"]}
+        run |= {"env_arg": options.env_arg, "time_limit": options.time_limit}
         run |= {"backend": options.backend, "device": learner.device, "seed": values.seed, "mode": values.mode}
         lists = {"returns": [episode.score for episode in episodes], "lengths": [episode.length for episode in episodes]}
         with writing(values.json), replacing(values.json) as file:
@@ -149,6 +161,16 @@ def _parse(arguments: Sequence[str]) -> argparse.Namespace:
         "--task", metavar="SUITE:NAME", help="play this task instead; needed where the checkpoint names a module, whose code would run"
     )
     parser.add_argument(
+        "--env-arg",
+        type=keywords.read,
+        action="append",
+        metavar="NAME=VALUE",
+        help="keyword argument of the environment in place of that of training, the value as JSON or else as text; one option for each",
+    )
+    parser.add_argument(
+        "--time-limit", type=int, metavar="N", help="steps of the environment that truncate an episode (default: that of training)"
+    )
+    parser.add_argument(
         "--mode", action="store_true", help="the most probable action instead of a sample; latents are sampled all the same"
     )
     parser.add_argument("--video", type=Path, metavar="FILE", help="a film of the first episode of environment 0: FILE.gif or FILE.mp4")
@@ -156,6 +178,8 @@ def _parse(arguments: Sequence[str]) -> argparse.Namespace:
     values = parser.parse_args(arguments)
     if values.episodes < 1 or values.seed < 0:
         parser.error(f"expected at least one episode and a seed of at least 0, got {values.episodes} and {values.seed}")
+    if values.time_limit is not None and values.time_limit < 1:
+        parser.error(f"--time-limit is {values.time_limit}; expected at least 1")
     return values
 
 

@@ -3,19 +3,21 @@
 gym:ID              any registered Gymnasium id, also one that a module registers: gym:CartPole-v1, gym:ALE/Pong-v5, gym:module:ID
 dmc:DOMAIN-TASK     DeepMind Control Suite from vectors: dmc:walker-walk
 dmc_vision:DOMAIN-TASK   the same from 64 x 64 images only
-MODULE:CALLABLE     your own: a function or class that, called without arguments, returns a gymnasium.Env: my_package.my_module:make_env
+MODULE:CALLABLE     your own: a function or class that returns a gymnasium.Env: my_package.my_module:make_env
 """
 
 import contextlib
 import importlib
 import inspect
 import sys
-from collections.abc import Sequence
+import traceback
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 
+from train import arguments as keywords
 from train.envs.adapter import ContractEnv
 from train.errors import UserError
 
@@ -27,44 +29,85 @@ _EXTRAS = {"box2d": "box2d", "mujoco": "mujoco", "classic_control": "train"}
 
 
 def make_env(
-    task: str, index: int = 0, image_size: int = 64, action_repeat: int = 1, info_metrics: Sequence[str] = (), render: bool = False
+    task: str,
+    index: int = 0,
+    image_size: int = 64,
+    action_repeat: int = 1,
+    info_metrics: Sequence[str] = (),
+    render: bool = False,
+    arguments: Mapping[str, Any] | None = None,
+    time_limit: int | None = None,
 ) -> ContractEnv:
     """The environment of a task string, adapted. `index` numbers the instances of a run, for messages. render: with the render mode
-    "rgb_array", where the environment has one. The others: see `ContractEnv`.
+    "rgb_array", where the environment has one. arguments: keyword arguments with which the environment is made. time_limit: frames after
+    which an episode is truncated, in place of the suite's limit: [LOOP-62]. The others: see `ContractEnv`.
 
     Raises:
-      UserError: an unknown task, a package that is not installed (with the pip command), an unsupported space.
+      UserError: an unknown task, a package that is not installed (with the pip command), arguments that the environment does not take, an
+      unsupported space.
     """
     suite, separator, name = task.partition(":")
     if not separator or not suite or not name:
         raise UserError(f"unknown task {task!r}; expected {SUITES}")
+    arguments = arguments or {}
     if suite == "gym":
-        env = _make_gymnasium(task, name, render)
+        env = _make_gymnasium(task, name, render, arguments, time_limit)
     elif suite in ("dmc", "dmc_vision"):
-        env = _make_dm_control(task, name, vision=suite == "dmc_vision", image_size=image_size, render=render)
+        if arguments:
+            raise UserError(f"task {task} takes no keyword arguments, and --env-arg {next(iter(arguments))} was given")
+        env = _limited(_make_dm_control(task, name, suite == "dmc_vision", image_size, render, time_limit), time_limit)
     else:
-        env = _make_own(task, suite, name, render)
+        env = _limited(_make_own(task, suite, name, render, arguments), time_limit)
     return ContractEnv(env, task, index, image_size, action_repeat, info_metrics)
 
 
-def _make_gymnasium(task: str, name: str, render: bool) -> gymnasium.Env[Any, Any]:
+def _limited(env: gymnasium.Env[Any, Any], time_limit: int | None) -> gymnasium.Env[Any, Any]:
+    return gymnasium.wrappers.TimeLimit(env, time_limit) if time_limit else env
+
+
+def _make_gymnasium(task: str, name: str, render: bool, arguments: Mapping[str, Any], time_limit: int | None) -> gymnasium.Env[Any, Any]:
     namespace = name.split("/")[0]
     if namespace in _NAMESPACES:
         module, extra = _NAMESPACES[namespace]
         gymnasium.register_envs(_import(module, extra, task))
     if ":" in name:
         _import_own(task, name.split(":")[0])
+    if "max_episode_steps" in arguments:  # Gymnasium's own, which would be set twice.
+        raise UserError(f"--env-arg max_episode_steps is no argument of {task}; the option is --time-limit N")
+    given = {"disable_env_checker": True, **arguments} | ({"max_episode_steps": time_limit} if time_limit else {})
     try:
         if render:
             with contextlib.suppress(TypeError):  # It takes no render_mode.
-                return gymnasium.make(name, disable_env_checker=True, render_mode="rgb_array")
-        return gymnasium.make(name, disable_env_checker=True)
+                return gymnasium.make(name, **{**given, "render_mode": "rgb_array"})
+        with _naming(task, arguments):
+            return gymnasium.make(name, **given)
     except gymnasium.error.DependencyNotInstalled as error:
         raise UserError(f"task {task} needs another package: {_gymnasium_extra(name) or error}") from error
     except ModuleNotFoundError as error:
         raise UserError(f"task {task} needs the package {error.name}: {_gymnasium_extra(name) or 'install it with pip'}") from error
     except gymnasium.error.Error as error:
-        raise UserError(f"unknown task {task!r}: {error}") from error
+        is_known = name.rpartition(":")[2] in gymnasium.registry
+        raise UserError(f"{f'task {task}{_given(arguments)}' if is_known else f'unknown task {task!r}'}: {error}") from error
+    except RuntimeError as error:
+        if "MUJOCO_GL" not in str(error):  # What MuJoCo says of a value that it does not know.
+            raise
+        raise UserError(f"task {task}: {error}; set it to egl, osmesa or disabled, or unset it") from error
+
+
+@contextlib.contextmanager
+def _naming(task: str, arguments: Mapping[str, Any]) -> Iterator[None]:
+    """What the code of an environment raises of keyword arguments that it cannot use becomes a line that names them."""
+    try:
+        yield
+    except (TypeError, ValueError, LookupError, AttributeError, AssertionError) as error:
+        if not arguments:
+            raise
+        details = "" if "keyword argument" in str(error) else traceback.format_exc()
+        raise UserError(f"task {task}{_given(arguments)}: {type(error).__name__}: {error}", details) from error
+
+
+def _given(arguments: Mapping[str, Any]) -> str:
+    return "".join(f" --env-arg {argument}" for argument in keywords.write(arguments))
 
 
 def _gymnasium_extra(name: str) -> str:
@@ -74,26 +117,27 @@ def _gymnasium_extra(name: str) -> str:
     return next((_pip(extra) for folder, extra in _EXTRAS.items() if f"gymnasium.envs.{folder}" in entry_point), "")
 
 
-def _make_dm_control(task: str, name: str, vision: bool, image_size: int, render: bool) -> gymnasium.Env[Any, Any]:
-    adapter = _import("train.envs.dm_control", "dm-control", task)
-    adapter.choose_renderer(vision or render)
-    try:
-        _import("dm_control.suite", "dm-control", task)
-    except (ImportError, AttributeError, RuntimeError) as error:  # What a missing graphics library looks like.
-        raise UserError(
-            f"task {task}: dm_control cannot render ({error}); install EGL (Debian: libegl1 libgl1) or OSMesa (libosmesa6), "
-            "and set MUJOCO_GL to egl or osmesa"
-        ) from error
+def _make_dm_control(task: str, name: str, vision: bool, image_size: int, render: bool, time_limit: int | None) -> gymnasium.Env[Any, Any]:
     domain, _, control_task = name.partition("-")
-    return adapter.make(task, domain, control_task, image_size if vision else None)
+    try:
+        adapter = importlib.import_module("train.envs.dm_control")
+        env: gymnasium.Env[Any, Any] = adapter.make(
+            task, domain, control_task, image_size if vision else None, renders=render, limited=not time_limit
+        )
+    except ModuleNotFoundError as error:
+        raise UserError(f"task {task} needs the package {error.name}: {_pip('dm-control')}") from error
+    return env
 
 
-def _make_own(task: str, module_name: str, name: str, render: bool) -> gymnasium.Env[Any, Any]:
+def _make_own(task: str, module_name: str, name: str, render: bool, arguments: Mapping[str, Any]) -> gymnasium.Env[Any, Any]:
     module = _import_own(task, module_name)
     function = getattr(module, name, None)
     if not callable(function):
         raise UserError(f"unknown task {task!r}: the module {module_name!r} has no function or class {name!r}")
-    env = function(render_mode="rgb_array") if render and "render_mode" in inspect.signature(function).parameters else function()
+    if render and "render_mode" in inspect.signature(function).parameters:
+        arguments = {**arguments, "render_mode": "rgb_array"}
+    with _naming(task, arguments):
+        env = function(**arguments)
     if not isinstance(env, gymnasium.Env):
         raise UserError(f"task {task}: {name}() returned a {type(env).__name__}; expected a gymnasium.Env")
     return env

@@ -15,7 +15,6 @@ import json
 import mmap
 import os
 import re
-import resource
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -26,6 +25,7 @@ from numpy.typing import NDArray
 from train.errors import UserError
 from train.files import Unreadable, entries, open_file, reading
 from train.replay.layout import Layout, Sections
+from train.replay.positioned import BINARY, most_descriptors, read_at, write_at
 
 PAGE = 4096
 MAGIC = "dreamer-spec replay chunk"
@@ -93,9 +93,8 @@ class ChunkStore:
         self.directory, self.shape, self.memory_limit = directory, shape, memory_limit
         self._open: collections.OrderedDict[int, OpenChunk] = collections.OrderedDict()
         self._spare: list[Path] = []
-        descriptors = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
         # A mapping holds a descriptor too, and half of them stay free for others.
-        self._most_open = max(1, min(memory_limit // shape.file_bytes, max(descriptors, 64) // 4))
+        self._most_open = max(1, min(memory_limit // shape.file_bytes, max(most_descriptors(), 64) // 4))
 
     @property
     def mapped_bytes(self) -> int:
@@ -118,7 +117,7 @@ class ChunkStore:
                     write_all(file.fileno(), self.shape.header(number), 0)
                 self._spare.pop().rename(path)
                 return
-            fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o644)  # Never over a file that is there already.
+            fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | BINARY, 0o644)  # Never over a file that is there already.
             try:
                 reserve(fd, self.shape.file_bytes)
                 write_all(fd, self.shape.header(number), 0)
@@ -137,7 +136,7 @@ class ChunkStore:
         while len(self._open) >= self._most_open:
             self._open.popitem(last=False)
         with disk_errors(self.directory):
-            fd = os.open(self.path(number), os.O_RDWR)
+            fd = os.open(self.path(number), os.O_RDWR | BINARY)
             try:
                 mapping = mmap.mmap(fd, self.shape.file_bytes, access=mmap.ACCESS_READ)
             except (OSError, ValueError):
@@ -217,7 +216,7 @@ class ChunkStore:
         size = self.layout.section_bytes[-1]
         start = self.shape.offsets[-1]
         return [
-            zlib.crc32(os.pread(fd, (min((index + 1) * block, count) - index * block) * size, start + index * block * size))
+            zlib.crc32(read_at(fd, (min((index + 1) * block, count) - index * block) * size, start + index * block * size))
             for index in blocks
         ]
 
@@ -228,7 +227,7 @@ class ChunkStore:
     def _pieces(self, fd: int, section: int, count: int) -> Iterator[bytes]:
         start, end = self.shape.offsets[section], self.shape.offsets[section] + count * self.layout.section_bytes[section]
         for offset in range(start, end, 1 << 20):
-            yield os.pread(fd, min(1 << 20, end - offset), offset)
+            yield read_at(fd, min(1 << 20, end - offset), offset)
 
 
 def chunk_path(directory: Path, number: int) -> Path:
@@ -292,7 +291,7 @@ def write_all(fd: int, data: bytes | NDArray[np.uint8], offset: int) -> None:
     """Writes all of it, in as many calls as it takes."""
     left = memoryview(data) if isinstance(data, bytes) else np.ascontiguousarray(data).reshape(-1).data
     while left:
-        written = os.pwrite(fd, left, offset)
+        written = write_at(fd, left, offset)
         left, offset = left[written:], offset + written
 
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from train.files import open_file, reading
 from train.replay.chunks import disk_errors, numbers, write_all
+from train.replay.positioned import BINARY
 
 _HEADER = struct.Struct("<QIII")
 
@@ -38,7 +39,8 @@ class Journal:
     def __init__(self, directory: Path, epoch: int) -> None:
         self._directory = directory
         with disk_errors(directory):
-            self._fd = os.open(journal_path(directory, epoch), os.O_RDWR | os.O_CREAT | os.O_TRUNC | getattr(os, "O_NOFOLLOW", 0), 0o644)
+            flags = os.O_RDWR | os.O_CREAT | os.O_TRUNC | getattr(os, "O_NOFOLLOW", 0) | BINARY
+            self._fd = os.open(journal_path(directory, epoch), flags, 0o644)
         self._size = 0
 
     def append(self, chunk: int, row: int, latents: NDArray[np.uint8]) -> None:

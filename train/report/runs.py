@@ -15,7 +15,7 @@ from train.files import SUMS, Unreadable, entries, read_json
 from train.logger import iterate_metrics
 
 # Of the options, beside task, backend and hyperparameters, those that change what is learned: runs of one group agree in all of them.
-LEARNING_OPTIONS = ("action_repeat", "image_size", "replay_deter")
+LEARNING_OPTIONS = ("env_arg", "time_limit", "action_repeat", "image_size", "replay_deter")
 LABELS = ("backend", "profile", "size", *LEARNING_OPTIONS)  # what may tell groups apart, beside hyperparameters that were changed
 
 
