@@ -12,8 +12,10 @@ from spec import Spaces, Vector, load_config
 from train.machine import describe
 from train.policy import Policy
 from train.saved_agent import SavedAgent, acting_table
+from train.translation import Entry, Translation
 
 SPACES = Spaces({"observation": Vector(24)}, {"action": Vector(6)})
+TASK = Translation(SPACES, {"observation": Entry((), (24,), "float32")}, {"action": Entry((), (6,), "float32", (-1.0,), (1.0,))})
 REPEATS, SECONDS = 5, 1.0
 
 
@@ -21,7 +23,7 @@ def rate(size: str, rows: int) -> float:
     """The best of some repeats."""
     rng, config = np.random.default_rng(0), load_config("paper", size)
     parameters = {name: rng.normal(0, 0.05, entry.shape).astype(np.float32) for name, entry in acting_table(config, SPACES).items()}
-    policy = Policy(SavedAgent(config, SPACES, parameters, {}))
+    policy = Policy(SavedAgent(config, SPACES, parameters, {}, TASK))
     policy.reset(rows)
     observation, is_first = {"observation": rng.normal(size=(rows, 24))}, np.zeros(rows, bool)
     rates = []

@@ -41,7 +41,8 @@ def test_the_command_gives_every_option() -> None:
             continue
         words.append(action.option_strings[0])
         if action.nargs != 0:
-            unusual = [choice for choice in action.choices or ["7"] if choice != getattr(plain, action.dest, "12m")]
+            usual = ["width=7"] if action.dest == "env_args" else ["7"]
+            unusual = [choice for choice in action.choices or usual if choice != getattr(plain, action.dest, "12m")]
             words.append(unusual[-1])
     options = parse(words)
     same = [field.name for field in dataclasses.fields(options) if getattr(options, field.name) == getattr(plain, field.name)]

@@ -247,7 +247,7 @@ def load_policy(folder: Path) -> SavedAgent:
     policy = Policy.load(folder)
     act(policy)
     parameters = {name: array.astype(np.float32) for name, array in policy._parameters.items()}
-    return SavedAgent(policy.config, policy.spaces, parameters, dict(policy.info))
+    return SavedAgent(policy.config, policy.spaces, parameters, dict(policy.info), policy.translation)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -74,7 +74,7 @@ def test_a_policy_holds_what_acting_needs_and_nothing_else(checkpoint: Path, fol
 def test_a_policy_says_what_it_is_and_where_it_comes_from(checkpoint: Path, folder: Path) -> None:
     info = json.loads((folder / "policy.json").read_text())
     named = {name: info[name] for name in ("format", "task", "step", "backend", "action_repeat", "image_size")}
-    assert named == {"format": 1, "task": "gym:Robot-v0", "step": 1000, "backend": "jax", "action_repeat": 2, "image_size": 16}
+    assert named == {"format": 2, "task": "gym:Robot-v0", "step": 1000, "backend": "jax", "action_repeat": 2, "image_size": 16}
     assert info["source"] == {"checkpoint": str(checkpoint), "seed": 3, "train_steps": 10}
     assert set(info["versions"]) == {"dreamer-spec", "python", "numpy"}
     assert info["spaces"]["actions"]["buttons"] == {"kind": "discrete", "classes": [2, 3]}
@@ -204,10 +204,24 @@ def test_the_caller_may_write_into_an_action(policy: Policy, folder: Path) -> No
 @pytest.mark.covers("LOOP-12")
 def test_what_the_environment_receives(policy: Policy) -> None:
     flat = [[0.5, -7.0, 0, 1, 0, 0, 1]]
-    taken = policy.environment_action(flat, low={"arm": [0, -1]}, high={"arm": [10, np.inf]})
-    assert {key: value.tolist() for key, value in taken.items()} == {"arm": [[7.5, -1.0]], "buttons": [[1, 2]]}
-    with pytest.raises(ValueError, match=r"low: the action 'arm' needs bounds of shape \[2\], got the keys \[\]"):
-        policy.environment_action(flat)
+    (taken,) = policy.environment_action(flat)
+    assert {key: value.tolist() for key, value in taken.items()} == {"arm": [0.5, -1.0], "buttons": [1, 2]}
+    with pytest.raises(ValueError, match=r"action: expected shape \[\.\.\., 7\], got \[1, 6\]"):
+        policy.environment_action([flat[0][:6]])
+    with pytest.raises(ValueError, match="not finite"):
+        policy.environment_action([[np.nan, *flat[0][1:]]])
+
+
+@pytest.mark.covers("LOOP-63")
+def test_what_the_environment_returns_is_what_the_policy_sees(policy: Policy) -> None:
+    raw = [{key: value[row] for key, value in observation().items()} for row in range(ROWS)]
+    seen = policy.observation(raw)
+    assert {key: (value.tobytes(), value.shape) for key, value in seen.items()} == {
+        key: (np.asarray(value, seen[key].dtype).tobytes(), value.shape) for key, value in observation().items()
+    }
+    raw[1] = {**raw[1], "position": np.full(3, np.nan)}
+    with pytest.raises(ValueError, match="'position' holds nan"):
+        policy.observation(raw)
 
 
 WRONG = [
@@ -279,7 +293,7 @@ def cartpole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_the_example_of_the_document_runs(cartpole: Path) -> None:
     (example,) = blocks("python")
-    assert len(example.splitlines()) == 15
+    assert len(example.splitlines()) == 14
     assert main(["export", "runs/CartPole-v1-jax-seed0", "policy"]) == 0
     environment = {"PYTHONPATH": str(ROOT), "PATH": ""}
     done = subprocess.run([sys.executable, "-c", example], check=True, capture_output=True, text=True, env=environment)

@@ -6,6 +6,7 @@ import json
 import os
 import secrets
 import shlex
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,12 +26,20 @@ About = dict[str, Any]
 
 
 def write_about(
-    options: Options, *, spaces: Spaces, device: str, parameters: int, preflight: "Report | None", resumed_at: int | None
+    options: Options,
+    *,
+    spaces: Spaces,
+    device: str,
+    parameters: int,
+    preflight: "Report | None",
+    resumed_at: int | None,
+    understood: Sequence[str] = (),
 ) -> About:
     """Writes LOGDIR/run.json, complete or not at all, and returns what stands there.
 
     device: as the learner names it. parameters: how many numbers are trained. preflight: its result, None if it was skipped. resumed_at:
-    the environment step of the checkpoint that is continued, None for a new run. A resumed run keeps its `id` and its earlier `starts`;
+    the environment step of the checkpoint that is continued, None for a new run. understood: what the environment's spaces became, in
+    words. A resumed run keeps its `id` and its earlier `starts`;
     all else describes this start.
 
     Raises:
@@ -57,6 +66,7 @@ def write_about(
         "hyperparameters": dataclasses.asdict(options.config),
         "changed_hyperparameters": changed,
         "spaces": spaces.to_json(),
+        "understood": list(understood),
         "preflight": dataclasses.asdict(preflight) if preflight else None,
         "machine": machine,
         "starts": [*(starts if isinstance(starts, list) else []), start],
@@ -78,7 +88,7 @@ def read_about(logdir: Path) -> About | None:
 def command_line(options: Options) -> list[str]:
     """The words of a command that gives these options, whatever the presets are."""
     profile, size, changed = nearest(options.config)
-    defaults = {field.name: field.default for field in dataclasses.fields(options)} | presets()["base"]
+    defaults = {field.name: field.default for field in dataclasses.fields(options)} | {"env_args": {}} | presets()["base"]
     words = ["train", "--backend", options.backend, "--task", options.task, "--profile", profile, "--size", size]
     for field in dataclasses.fields(options):
         value = getattr(options, field.name)
@@ -87,8 +97,10 @@ def command_line(options: Options) -> list[str]:
         flag = field.name.replace("_", "-")
         if isinstance(value, bool):
             words.append(f"--{flag}" if value else f"--no-{flag}")
+        elif isinstance(value, Mapping):
+            words += [word for name, entry in value.items() for word in ("--env-arg", f"{name}={json.dumps(entry)}")]
         else:
-            words += [f"--{flag}", str(value)]
+            words += [f"--{flag}", _show(value)]
     for name, value in changed.items():
         words += [f"--{name.replace('_', '-')}", _show(value)]
     return words

@@ -22,7 +22,7 @@ from safetensors.numpy import save_file
 from train.errors import UserError
 from train.files import SUMS, Arrays, flush, read_arrays, read_json, require_intact, seal
 
-FORMAT = 3
+FORMAT = 4  # Since 4 it says how the environment's values are translated: what a policy made of it needs to act.
 OURS = re.compile(r"\d{12}(\.tmp|\.old)?")  # .tmp: being written; .old: about to be replaced by the same step
 FILES = ("learner.safetensors", "loop.safetensors", "run.json")
 
@@ -139,6 +139,13 @@ def require_same_spaces(checkpoint: Checkpoint, given: Mapping[str, Any]) -> Non
     _require_same(checkpoint, _entries(checkpoint.info["spaces"]), _entries(given))
 
 
+def require_same_translation(checkpoint: Checkpoint, given: Mapping[str, Any]) -> None:
+    """Raises:
+    UserError: bounds, dtypes or keys of the task are not those of the checkpoint; the message lists them. [LOOP-64]
+    """
+    _require_same(checkpoint, _entries(checkpoint.info["translation"]), _entries(json.loads(json.dumps(given))))
+
+
 def _require_same(checkpoint: Checkpoint, saved: Mapping[str, Any], given: Mapping[str, Any]) -> None:
     given = json.loads(json.dumps(given))  # Tuples become lists, as in the file.
     names = [name for name in {**saved, **given} if saved.get(name) != given.get(name)]
@@ -150,7 +157,8 @@ def _require_same(checkpoint: Checkpoint, saved: Mapping[str, Any], given: Mappi
 
 def _entries(spaces: Mapping[str, Any]) -> dict[str, Any]:
     """observations: {x: ...} -> "observations x": ..., so that a difference names one key."""
-    return {f"{kind} {key}": entry for kind, entries in spaces.items() for key, entry in entries.items()}
+    named = {kind: entries if isinstance(entries, dict) else dict(enumerate(entries)) for kind, entries in spaces.items()}
+    return {f"{kind} {key}": entry for kind, entries in named.items() for key, entry in entries.items()}
 
 
 def _show(value: Any) -> str:

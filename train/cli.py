@@ -2,6 +2,7 @@
 
 import argparse
 import importlib
+import json
 import math
 import sys
 from collections.abc import Callable, Sequence
@@ -61,6 +62,8 @@ def parse(arguments: Sequence[str]) -> Options:
     """
     values = vars(build_parser().parse_args([_with_dashes(argument) for argument in arguments]))
     given = {name: value for name, value in values.items() if value is not None}
+    if "env_args" in given:
+        given["env_args"] = dict(given["env_args"])
     backend, preset = given.pop("backend"), given.pop("preset", None)
     overrides = {name: given.pop(name) for name in hyperparameters() if name in given}
     return make_options(backend, given, overrides, preset)
@@ -121,6 +124,24 @@ def build_parser() -> argparse.ArgumentParser:
     envs = parser.add_argument_group("environments")
     envs.add_argument("--action-repeat", type=_whole(1), metavar="N", help="apply each action N times (default 1)")
     envs.add_argument("--image-size", type=_whole(1), metavar="N", help="side to which images are resized, in pixels (default 64)")
+    envs.add_argument(
+        "--observations", type=_words, metavar="KEY,...", help="use only these keys; `*` stands for any letters (default: all)"
+    )
+    envs.add_argument("--leave-out", type=_words, metavar="KEY,...", help="do not use these keys of the observations")
+    envs.add_argument(
+        "--env-arg",
+        dest="env_args",
+        action="append",
+        type=_assignment,
+        metavar="NAME=VALUE",
+        help="a keyword argument of gymnasium.make, the suite's task or your function; VALUE is read as JSON if it can be; may be repeated",
+    )
+    envs.add_argument(
+        "--time-limit",
+        type=_whole(1),
+        metavar="N",
+        help="end episodes after N frames, counted before action repeat; takes the place of a Gymnasium id's own limit",
+    )
     envs.add_argument("--processes", choices=PROCESSES, help="one process per environment; auto: if its steps are slow (default)")
 
     envs.add_argument(
@@ -243,6 +264,21 @@ def _boolean(text: str) -> bool:
     if text.lower() not in ("true", "false"):
         raise argparse.ArgumentTypeError(f"{text!r} is neither true nor false")
     return text.lower() == "true"
+
+
+def _words(text: str) -> tuple[str, ...]:
+    return tuple(word for word in text.split(",") if word)
+
+
+def _assignment(text: str) -> tuple[str, Any]:
+    """is_slippery=false -> ("is_slippery", False)"""
+    name, separator, value = text.partition("=")
+    if not separator or not name.isidentifier():
+        raise argparse.ArgumentTypeError(f"{text!r} is not NAME=VALUE")
+    try:
+        return name, json.loads(value, parse_constant=str)
+    except ValueError:
+        return name, value
 
 
 def _numbers(text: str) -> list[int]:

@@ -23,7 +23,8 @@ class Options:
     """Everything that a run depends on, beside the code.
 
     steps and eval_every are environment steps: records times action_repeat. checkpoint_every, log_every and env_timeout are seconds.
-    replay_memory is in GiB.
+    replay_memory is in GiB. time_limit is in frames, before action repeat: [LOOP-28]. observations, leave_out: keys or patterns of keys;
+    all are used where `observations` is empty. env_args: keyword arguments of what makes the environment, in plain JSON types.
     """
 
     backend: str
@@ -35,6 +36,10 @@ class Options:
     device: str | None = None
     action_repeat: int = 1
     image_size: int = 64
+    observations: tuple[str, ...] = ()
+    leave_out: tuple[str, ...] = ()
+    env_args: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    time_limit: int | None = None
     eval_every: int = 0
     eval_episodes: int = 10
     random_episodes: int = 10
@@ -54,9 +59,9 @@ class Options:
 
     def identity(self) -> dict[str, Any]:
         """What a checkpoint must agree in to be continued. The backend is not in it: either continues what the other began."""
-        run = {name: getattr(self, name) for name in ("task", "seed", "action_repeat", "image_size", "replay_deter")}
-        config = {name: list(value) if isinstance(value, tuple) else value for name, value in dataclasses.asdict(self.config).items()}
-        return run | config
+        task = ("task", "action_repeat", "image_size", "observations", "leave_out", "env_args", "time_limit")
+        values = {name: getattr(self, name) for name in (*task, "seed", "replay_deter")} | dataclasses.asdict(self.config)
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
 
 
 @functools.cache

@@ -17,6 +17,7 @@ from train.options import Options
 from train.state import Counters, Means, Run
 
 COUNTERS = {name: type(value) for name, value in dataclasses.asdict(Counters()).items()}
+TRANSLATION = {"observations": dict, "actions": dict, "left_out": list}
 FROM_BOUNDARY = "new episodes begin, those under way when it was saved are abandoned"
 
 
@@ -40,6 +41,7 @@ def save(run: Run) -> Path:
     info = {
         "identity": run.options.identity(),
         "spaces": run.envs.spaces.to_json(),
+        "translation": run.envs.translation.to_json(),
         "backend": run.options.backend,
         "counters": dataclasses.asdict(run.counters),
         "environments": [history and history.to_json() for history in histories],
@@ -134,6 +136,8 @@ def _require_sound(saved: Checkpoint) -> None:
     sound = {
         "identity": isinstance(info.get("identity"), dict),
         "spaces": _is_of(info.get("spaces"), lambda entries: isinstance(entries, dict)),
+        "translation": isinstance(info.get("translation"), dict)
+        and all(isinstance(info["translation"].get(name), kind) for name, kind in TRANSLATION.items()),
         "backend": isinstance(info.get("backend"), str),
         "counters": isinstance(info.get("counters"), dict)
         and {name: type(value) for name, value in info["counters"].items()} == COUNTERS

@@ -13,19 +13,26 @@ from spec import Config, Parameter, Spaces, hyperparameters, load_config, parame
 from train.checkpoint import Checkpoint
 from train.errors import UserError
 from train.files import Arrays
+from train.translation import Translation
 
-INFO = {"task": str, "step": int, "backend": str, "action_repeat": int, "image_size": int, "source": dict, "versions": dict}
+INFO = {"task": str, "step": int, "backend": str, "action_repeat": int, "image_size": int}
+INFO |= {"environment": dict, "source": dict, "versions": dict}
+ENVIRONMENT = ("observations", "leave_out", "env_args", "time_limit")  # options that make the environment
 MOST_LAYERS = 1000  # of a network: no description is believed that would need more memory than the parameters
 
 
 @dataclasses.dataclass(frozen=True)
 class SavedAgent:
-    """parameters: name -> float32 array. info: the entries of INFO; step: environment steps, with action repeat."""
+    """parameters: name -> float32 array. info: the entries of INFO; step: environment steps, with action repeat.
+
+    translation: how values of the environment become arrays of the spaces, and actions the environment's.
+    """
 
     config: Config
     spaces: Spaces
     parameters: Arrays
     info: dict[str, Any]
+    translation: Translation
 
 
 def agent_of(checkpoint: Checkpoint) -> SavedAgent:
@@ -40,13 +47,15 @@ def agent_of(checkpoint: Checkpoint) -> SavedAgent:
             raise ValueError("run.json: expected the objects identity and counters")
         config = config_from_json({name: identity[name] for name in hyperparameters() if name in identity})
         spaces = Spaces.from_json(checkpoint.info.get("spaces"))
+        translation = Translation.from_json(checkpoint.info.get("translation"), spaces)
         info: dict[str, Any] = {name: identity.get(name) for name in ("task", "action_repeat", "image_size")}
         info |= {"step": counters.get("records"), "backend": checkpoint.info.get("backend"), "versions": versions()}
+        info["environment"] = {name: identity.get(name) for name in ENVIRONMENT}
         info["source"] = {"checkpoint": str(checkpoint.path), "seed": identity.get("seed"), "train_steps": counters.get("train_steps")}
         check_info(info, spaces)
         info["step"] *= info["action_repeat"]
         trained = {name.removeprefix("params/"): array for name, array in state.items() if name.startswith("params/")}
-        return SavedAgent(config, spaces, checked_parameters(trained, parameter_table(config, spaces)), info)
+        return SavedAgent(config, spaces, checked_parameters(trained, parameter_table(config, spaces)), info, translation)
     except ValueError as error:
         raise UserError(f"the checkpoint {checkpoint.path} does not hold an agent: {error!s:.500}") from error
 
@@ -81,6 +90,15 @@ def check_info(info: Mapping[str, Any], spaces: Spaces) -> None:
     for name, least in (("step", 0), ("action_repeat", 1), ("image_size", 1)):
         if info[name] < least:
             raise ValueError(f"{name} is {info[name]}; expected at least {least}")
+    match info["environment"]:
+        case {"observations": [*use], "leave_out": [*leave_out], "env_args": dict(), "time_limit": limit} if (
+            len(info["environment"]) == len(ENVIRONMENT)
+            and all(isinstance(pattern, str) for pattern in (*use, *leave_out))
+            and (limit is None or (type(limit) is int and limit >= 1))
+        ):
+            pass
+        case given:
+            raise ValueError(f"environment: expected the options {', '.join(ENVIRONMENT)}, got {given!r:.80}")
     for key, image in spaces.images.items():
         if image.height != info["image_size"] or image.width != info["image_size"]:
             raise ValueError(f"the image {key!r} is {image.height} x {image.width}, but image_size is {info['image_size']}")

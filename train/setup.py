@@ -1,6 +1,5 @@
 """From options to a run that is ready to start: whatever the user may have got wrong is found here."""
 
-import functools
 import math
 from contextlib import ExitStack, closing
 from typing import TYPE_CHECKING, Any
@@ -13,7 +12,7 @@ from train import checkpoint, resume
 from train.about import write_about
 from train.backend import Learner, learner_class
 from train.checkpoint import Checkpoint
-from train.envs import Environments, Record, is_slow, make_env
+from train.envs import Environments, Record, env_maker, is_slow
 from train.errors import UserError
 from train.evaluation import play_randomly
 from train.logger import Display, Logger
@@ -35,13 +34,22 @@ def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -
     envs, test_envs = _make_environments(options, stack)
     if saved:
         checkpoint.require_same_spaces(saved, envs.spaces.to_json())
+        checkpoint.require_same_translation(saved, envs.translation.to_json())
+    for line in envs.translation.lines:
+        display.say(line)
     parameters = _count_parameters(options, envs.spaces)
     agent = make_learner(learner_type, options, envs.spaces)  # Before preflight: it says what is wrong with the device.
     report = _preflight(options, envs.spaces, display) if options.preflight else None
     replay, saved, record = _open_replay(options, saved, envs, display)
     starts, step = _progress(options, saved)
     about = write_about(
-        options, spaces=envs.spaces, device=agent.device, parameters=parameters, preflight=report, resumed_at=step if saved else None
+        options,
+        spaces=envs.spaces,
+        device=agent.device,
+        parameters=parameters,
+        preflight=report,
+        resumed_at=step if saved else None,
+        understood=envs.translation.lines,
     )
     logger = Logger(options.logdir, saved.info["log"] if saved else None, wandb=options.wandb, about=about)
     for line in logger.warnings:
@@ -135,7 +143,7 @@ def import_learner(backend: str) -> type[Learner]:
 
 def _make_environments(options: Options, stack: ExitStack) -> tuple[Environments, Environments | None]:
     """The environments of training, and those of evaluation if there is any."""
-    make = functools.partial(make_env, options.task, image_size=options.image_size, action_repeat=options.action_repeat)
+    make = env_maker(options)
     count, processes = options.config.envs, options.processes == "yes"
     if options.processes == "auto" and count > 1:
         processes = is_slow(make, options.seed)

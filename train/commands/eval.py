@@ -1,7 +1,6 @@
 """`train eval CHECKPOINT --episodes N`: plays episodes with the agent of a checkpoint, on either backend."""
 
 import argparse
-import functools
 import json
 import math
 import statistics
@@ -15,7 +14,7 @@ from reference_numpy.training_loop import derive_seed
 from train.backend import Learner
 from train.checkpoint import open_checkpoint
 from train.cli import Parser
-from train.envs import Environments, Record, is_slow, make_env
+from train.envs import Environments, Record, env_maker, is_slow
 from train.errors import UserError, writing
 from train.evaluation import Agent, Episode, play_episodes, report_failures
 from train.logger import Display
@@ -49,9 +48,10 @@ def main(arguments: Sequence[str]) -> int:
         device=values.device,
         action_repeat=saved.info["action_repeat"],
         image_size=saved.info["image_size"],
+        **saved.info["environment"],
     )
     learner_type = import_learner(options.backend)
-    make = functools.partial(make_env, options.task, image_size=options.image_size, action_repeat=options.action_repeat)
+    make = env_maker(options)
     count = min(saved.config.envs, values.episodes)
     with closing(Environments(make, count, count > 1 and is_slow(make, options.seed))) as envs:
         if envs.spaces != saved.spaces:

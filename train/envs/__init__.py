@@ -1,11 +1,12 @@
 """Environments in the form of spec/00-notation.md: tasks by name, spaces and values translated and checked, many run in parallel."""
 
 from train.envs.adapter import ContractEnv
-from train.envs.factory import make_env
+from train.envs.factory import env_maker, make_env
 from train.envs.history import History
-from train.envs.spaces import Translation, random_actions, translate
+from train.envs.spaces import random_actions, translate
 from train.envs.stream import Failure
 from train.envs.vector import Environments, Record, is_slow
+from train.translation import Translation
 
 __all__ = [
     "ContractEnv",
@@ -14,6 +15,7 @@ __all__ = [
     "History",
     "Record",
     "Translation",
+    "env_maker",
     "is_slow",
     "make_env",
     "random_actions",

@@ -1,6 +1,7 @@
 """One environment as the contract wants it: a Gymnasium environment with arrays in, arrays out, and everything that comes in checked."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
@@ -25,14 +26,24 @@ class ContractEnv(gymnasium.Env[Observation, np.ndarray]):
     """Wraps an environment: observations become arrays of `spec.Spaces`, flat actions become the environment's, actions are repeated.
 
     env: the environment. task, index: its name and number, for messages. image_size: side of every image, in pixels. action_repeat: how
-    often each action is applied; the rewards are summed, and the repetition stops where the episode ends.
+    often each action is applied; the rewards are summed, and the repetition stops where the episode ends. observations, leave_out: which
+    keys, or patterns of keys, to use and not to use; all where `observations` is empty.
 
     Raises:
       UserError: an unsupported space.
       Garbage: from `reset` and `step`, whatever the environment returns that its spaces do not allow, NaN included.
     """
 
-    def __init__(self, env: gymnasium.Env[Any, Any], task: str, index: int = 0, image_size: int = 64, action_repeat: int = 1) -> None:
+    def __init__(
+        self,
+        env: gymnasium.Env[Any, Any],
+        task: str,
+        index: int = 0,
+        image_size: int = 64,
+        action_repeat: int = 1,
+        observations: Sequence[str] = (),
+        leave_out: Sequence[str] = (),
+    ) -> None:
         self.task = task
         self._env = env
         self._index = index
@@ -41,10 +52,10 @@ class ContractEnv(gymnasium.Env[Observation, np.ndarray]):
         self._seed: int | None = None
         self._episode = 0
         try:
-            self._translation = translate(env.observation_space, env.action_space, image_size)
+            self.translation = translate(env.observation_space, env.action_space, image_size, observations, leave_out)
         except UserError as error:
             raise UserError(f"task {task}: {error}") from error
-        self.spaces: Spaces = self._translation.spaces
+        self.spaces: Spaces = self.translation.spaces
         self.metadata = {}
         self.observation_space, self.action_space = array_spaces(self.spaces)
 
@@ -67,7 +78,7 @@ class ContractEnv(gymnasium.Env[Observation, np.ndarray]):
         self._steps += 1
         total = 0.0
         for _ in range(self._action_repeat):
-            value = self._env.step(self._translation.action(action))  # Made anew: an environment may write into it.
+            value = self._env.step(self.translation.action(action))  # A new one: an environment may write into it.
             if not isinstance(value, tuple) or len(value) != 5:
                 raise self._garbage(
                     f"step returned {_describe(value)}; Gymnasium's step returns (observation, reward, terminated, truncated, info)"
@@ -85,8 +96,8 @@ class ContractEnv(gymnasium.Env[Observation, np.ndarray]):
 
     def _observation(self, value: Any) -> Observation:
         try:
-            return self._translation.observation(value)
-        except UserError as error:
+            return self.translation.observation(value)
+        except ValueError as error:
             raise self._garbage(str(error)) from error
 
     def _reward(self, value: Any) -> float:

@@ -5,6 +5,7 @@ Why not through Shimmy: its module imports interactive viewers and their package
 
 import os
 import sys
+import warnings
 from typing import Any
 
 import dm_env
@@ -15,19 +16,41 @@ from gymnasium import spaces as gym
 from train.errors import UserError
 
 CAMERAS = {"quadruped": 2}  # D-109; camera 0 elsewhere
+RENDER = ("quadruped-escape",)  # from vectors too: its terrain is drawn anew, and uploaded to the renderer, for every episode
+
+GLFW = (
+    "",
+    "glfw",
+    "on",
+    "1",
+    "enable",
+    "enabled",
+    "true",
+)  # what MUJOCO_GL may say for it; unset, dm_control takes it where it is installed
 
 
-def choose_renderer(vision: bool) -> None:
+def choose_renderer(renders: bool) -> None:
     """Before dm_control is imported: without a display, render through EGL, or not at all. MUJOCO_GL, where set, decides."""
     if sys.platform == "linux" and not os.environ.get("DISPLAY") and not os.environ.get("MUJOCO_GL"):
-        os.environ["MUJOCO_GL"] = "egl" if vision else "disabled"
+        os.environ["MUJOCO_GL"] = "egl" if renders else "disabled"
 
 
-def make(task: str, domain: str, name: str, image_size: int | None) -> gymnasium.Env[Any, Any]:
+def cannot_render(task: str, error: Exception) -> UserError:
+    chosen = os.environ.get("MUJOCO_GL")
+    return UserError(
+        f"task {task} needs to render, and with MUJOCO_GL {f'set to {chosen}' if chosen else 'not set'} dm_control cannot "
+        f"({type(error).__name__}: {error!s:.300}); set MUJOCO_GL to egl (Debian: libegl1 libgl1) or osmesa (libosmesa6) where there is no "
+        "display, to glfw where there is one"
+    )
+
+
+def make(task: str, domain: str, name: str, image_size: int | None, arguments: dict[str, Any], renders: bool) -> gymnasium.Env[Any, Any]:
     """The task `name` of `domain`; from vectors, or where image_size is given from images only.
 
+    arguments: of the suite's task. renders: it cannot do without a renderer, which is tried once.
+
     Raises:
-      UserError: no such task.
+      UserError: no such task, or no renderer.
     """
     from dm_control import suite
 
@@ -36,7 +59,13 @@ def make(task: str, domain: str, name: str, image_size: int | None) -> gymnasium
         known = ", ".join(sorted("-".join(entry) for entry in suite.ALL_TASKS if domain in ("", entry[0])))
         remedy = f"known: {known}" if known else f"known domains: {', '.join(sorted({entry[0] for entry in suite.ALL_TASKS}))}"
         raise UserError(f"unknown task {task!r}; {remedy}")
-    return DmControlEnv(suite.load(domain, name), image_size, CAMERAS.get(domain, 0))
+    env = DmControlEnv(suite.load(domain, name, task_kwargs=arguments), image_size, CAMERAS.get(domain, 0))
+    if renders:
+        try:
+            env.render_once()
+        except Exception as error:  # Each library raises errors of its own, some of them plain Exceptions.
+            raise cannot_render(task, error) from error
+    return env
 
 
 class DmControlEnv(gymnasium.Env[Any, np.ndarray]):
@@ -64,6 +93,12 @@ class DmControlEnv(gymnasium.Env[Any, np.ndarray]):
         terminated = step.last() and step.discount == 0
         return self._observation(step), step.reward, terminated, step.last() and not terminated, {}
 
+    def render_once(self) -> None:
+        """Raises what the renderer raises."""
+        if os.environ.get("MUJOCO_GL", "") in GLFW:
+            _require_display()
+        self._env.physics.render(1, 1)
+
     def _observation(self, step: dm_env.TimeStep) -> dict[str, np.ndarray]:
         if self._image_size is None:
             return step.observation
@@ -71,6 +106,18 @@ class DmControlEnv(gymnasium.Env[Any, np.ndarray]):
 
     def close(self) -> None:
         self._env.close()
+
+
+def _require_display() -> None:
+    """What GLFW says without one takes the process with it the second time that it is asked to draw."""
+    try:
+        import glfw
+    except ImportError:  # Then dm_control has taken another.
+        return
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        if not glfw.init():
+            raise RuntimeError("GLFW finds no display")
 
 
 def _unbounded(spec: Any) -> gym.Box:

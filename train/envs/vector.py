@@ -46,6 +46,7 @@ class Environments:
         first = make(0)
         self.count = count
         self.spaces = first.spaces
+        self.translation = first.translation
         self.failures = 0  # so far
         self._failures_allowed = failures_allowed
         self._failed_at: collections.deque[int] = collections.deque()  # records before each failure, of those in the window
