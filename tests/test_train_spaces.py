@@ -1,31 +1,25 @@
 """What is read into a task's spaces, what is said of it, and that training, evaluation and an exported policy act alike in every one."""
 
-import copy
-import ctypes.util
 import json
-import os
-import subprocess
+import re
+import shlex
 import sys
-from contextlib import ExitStack
+import types
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
 import train_fakes
 from gymnasium import spaces as gym
-from train_fakes import FakeLearner
 from train_runs import Make, run_quietly
 
 from reference_numpy.training_loop import environment_action
 from spec import Discrete, Image, Vector
-from train import resume, setup
-from train.cli import main
+from train.cli import parse
 from train.envs import ContractEnv, make_env, translate
 from train.errors import UserError
-from train.policy import Policy
-from train.translation import Translation
 
 ROOT = Path(__file__).resolve().parent.parent
 TWO = gym.Discrete(2)
@@ -337,272 +331,66 @@ def test_a_run_says_what_it_understood_before_anything_else(make: Make, capsys: 
     assert json.loads((options.logdir / "run.json").read_text())["understood"] == lines
 
 
-# Training, evaluation and export
+class Codes(train_fakes.Counting):
+    """Declares pixels, and shows codes."""
+
+    observation_space = gym.Box(0, 255, (48, 48, 1), U1)
+    most = 10
+
+    def reset(self, **given: Any) -> Any:
+        super().reset(**given)
+        return np.full((48, 48, 1), self.most, U1), {}
+
+    def step(self, action: np.ndarray) -> Any:
+        return np.full((48, 48, 1), self.most, U1), *super().step(action)[1:]
 
 
-class Kinds(gymnasium.Env[Any, Any]):
-    """Every kind of space, and a diary of what it returned and received."""
-
-    returned: ClassVar[list[Any]] = []
-    received: ClassVar[list[Any]] = []
-    observation_space = gym.Dict(
-        {
-            "camera": gym.Box(0, 255, (20, 30, 3), U1),
-            "floats": gym.Box(0, 1, (3, 16, 16), F4),
-            "frames": gym.Box(0, 255, (2, 16, 18, 1), I8),
-            "depth": gym.Box(0, 65535, (16, 16), np.uint16),
-            "board": gym.Box(1, 4, (3, 3), np.int8),
-            "mixed": gym.Box(np.array([[0, 5], [1, 0]]), np.array([[1, 9], [1, 3]]), dtype=I8),
-            "vector": gym.Box(-np.inf, np.inf, (2, 3), np.float64),
-            "scalar": gym.Box(-1, 1, (), F4),
-            "flags": gym.Box(0, 1, (4,), bool),
-            "body": gym.Tuple([gym.Discrete(5, start=-3), gym.Dict({"items": gym.MultiDiscrete([[2, 3]], start=[[1, -1]])})]),
-            "touch": gym.MultiBinary((2, 2)),
-            "notes": gym.Text(5),
-        }
-    )
-    action_space = gym.Dict(
-        {
-            "bounded": gym.Box(np.array([[-3, 0.1]]), np.array([[1, 0.3]]), dtype=np.float64),
-            "single": gym.Box(0, 5, (2,), F4),
-            "half": gym.Box(-2, 2, (1,), np.float16),
-            "open": gym.Box(np.array([-np.inf, 0, -np.inf, -1e10]), np.array([np.inf, np.inf, 5, 1e10]), dtype=np.float64),
-            "scalar": gym.Box(-1, 1, (), F4),
-            "discrete": gym.Discrete(4, start=-2),
-            "several": gym.MultiDiscrete([[2, 3], [4, 2]], start=[[0, 1], [-5, 9]]),
-            "binary": gym.MultiBinary(3),
-            "whole": gym.Box(np.array([[-1, 7]]), np.array([[1, 7]]), dtype=np.int16),
-            "switch": gym.Box(0, 1, (2,), bool),
-            "nested": gym.Tuple([gym.Dict({"left": gym.Discrete(2), "right": gym.Box(0, 9, (1,), F4)}), gym.Discrete(2, start=1)]),
-        }
-    )
-
-    def __init__(self, length: int = 5) -> None:
-        self._length = length
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        super().reset(seed=seed)
-        self._time = 0
-        self.observation_space.seed(seed)
-        return self._observation(), {}
-
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        assert self.action_space.contains(action), action
-        self.received.append(copy.deepcopy(action))
-        self._time += 1
-        return self._observation(), 1.0, False, self._time == self._length, {}
-
-    def _observation(self) -> Any:
-        value = {**self.observation_space.sample(), "notes": object()}
-        self.returned.append(value)
-        return value
-
-
-def bits(value: Any) -> Any:
-    """Structure, types, shapes, dtypes and bytes."""
-    if isinstance(value, dict):
-        return {key: bits(value[key]) for key in sorted(value)}
-    if isinstance(value, tuple):
-        return tuple(map(bits, value))
-    return type(value).__name__, value.dtype.str, value.shape, value.tobytes()
-
-
-@pytest.mark.covers("LOOP-12", "LOOP-31", "LOOP-60", "LOOP-63", "CON-34")
-def test_training_evaluation_and_an_exported_policy_act_alike(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each flat action, and each observation, that passed the environment of a run or of `train eval` is what the policy folder makes."""
-    monkeypatch.setattr(sys, "path", [str(ROOT / "tests"), *sys.path])
-    monkeypatch.setitem(sys.modules, "kinds", sys.modules[__name__])
-    passed: list[tuple[np.ndarray, Any, dict[str, np.ndarray], Any]] = []  # flat action, received; arrays, returned
-    step = ContractEnv.step
-
-    def watched(env: ContractEnv, action: np.ndarray) -> Any:
-        result = step(env, action)
-        passed.append((np.array(action), Kinds.received[-1], copy.deepcopy(result[0]), Kinds.returned[-1]))
-        return result
-
-    monkeypatch.setattr(ContractEnv, "step", watched)
-    run, folder = str(tmp_path / "run"), tmp_path / "policy"
-    words = "--size tiny --deter 16 --units 8 --stoch 3 --classes 5 --bins 31 --envs 2 --batch-size 2 --batch-length 4 --replay-ratio 1"
-    words += " --steps 40 --image-size 16 --leave-out notes --env-arg length=6 --no-preflight --processes no --eval-episodes 0"
-    words += " --random-episodes 0 --compute-dtype float32"
-    assert main(["--backend", "torch", "--task", "kinds:Kinds", "--logdir", run, *words.split()]) == 0
-    trained = len(passed)
-    assert main(["eval", run, "--episodes", "1", "--task", "kinds:Kinds"]) == 0  # One is played in this process.
-    assert trained >= 30
-    assert len(passed) - trained == 6
-    assert main(["export", run, str(folder)]) == 0
-    policy = Policy.load(folder)
-    for flat, received, arrays, returned in passed:
-        (action,) = policy.environment_action(flat[None])
-        assert bits(action) == bits(received)
-        row = {key: value[0] for key, value in policy.observation([returned]).items()}
-        assert bits(row) == bits(arrays)
-    assert len({str(bits(received)) for _, received, _, _ in passed}) > 20, "the actions must differ"
-    assert policy.info["environment"] == {"observations": [], "leave_out": ["notes"], "env_args": {"length": 6}, "time_limit": None}
-    # The policy acts alone.
-    env = Kinds()
-    observation, _ = env.reset(seed=0)
-    policy.reset(1)
-    for time in range(5):
-        action = policy(policy.observation([observation]), [time == 0])
-        observation, *_ = env.step(policy.environment_action(action)[0])
-
-
-@pytest.mark.covers("LOOP-63")
-def test_a_translation_survives_its_description() -> None:
-    translation = translate(Kinds.observation_space, Kinds.action_space, 16, leave_out=["notes"])
-    assert Translation.from_json(json.loads(json.dumps(translation.to_json())), translation.spaces) == translation
-
-
-@pytest.mark.parametrize(
-    ("place", "value"),
-    [
-        (("observations", "camera", "shape"), [20, 30, 4]),
-        (("observations", "camera", "shape"), [8, 30, 3]),
-        (("observations", "camera", "low"), []),
-        (("observations", "camera", "high"), [0]),
-        (("observations", "camera", "dtype"), "object"),
-        (("observations", "camera", "scalar"), True),
-        (("observations", "board", "low"), [0.5]),
-        (("observations", "board", "low"), [2**63]),
-        (("observations", "body_0", "path"), ["body", 2]),
-        (("observations", "body_0", "path"), ["body"]),
-        (("observations", "body_0", "path"), [["body"]]),
-        (("observations", "vector", "shape"), [2, 4]),
-        (("observations", "touch"), None),
-        (("actions", "bounded", "high"), [0, 0]),
-        (("actions", "bounded", "high"), [1e999, 1]),
-        (("actions", "bounded", "high"), [1, 2, 3]),
-        (("actions", "discrete", "path"), ["single"]),
-        (("actions", "discrete"), {"path": []}),
-        (("left_out",), [["body"]]),
-        (("left_out",), [[-1]]),
-        (("left_out",), "notes"),
-        (("more",), 1),
-    ],
-)
-@pytest.mark.covers("LOOP-63")
-def test_a_description_that_does_not_fit_is_refused(place: tuple[str, ...], value: Any) -> None:
-    translation = translate(Kinds.observation_space, Kinds.action_space, 16, leave_out=["notes"])
-    description = json.loads(json.dumps(translation.to_json()))
-    entry = description
-    for key in place[:-1]:
-        entry = entry[key]
-    entry[place[-1]] = value
-    with pytest.raises(ValueError, match="translation"):
-        Translation.from_json(description, translation.spaces)
-
-
-@pytest.mark.covers("LOOP-64")
-@pytest.mark.parametrize(
-    ("attribute", "space", "words"),
-    [
-        ("action_space", gym.Box(F4([0, -np.inf]), F4([20, np.inf])), ["actions action", "20.0", "10.0"]),
-        ("observation_space", gym.Box(-np.inf, np.inf, (2, 1), F4), ["observations observation", "[2, 1]"]),
-        ("observation_space", gym.Dict({"observation": gym.Box(-np.inf, np.inf, (2,), F4)}), ["observations observation", "path"]),
-    ],
-)
-def test_a_run_goes_on_in_the_same_environment_only(
-    make: Make, monkeypatch: pytest.MonkeyPatch, attribute: str, space: gymnasium.Space, words: list[str]
+@pytest.mark.covers("LOOP-61")
+@pytest.mark.parametrize(("most", "warned"), [(10, True), (31, True), (32, False), (0, False)])
+def test_images_that_hold_codes_are_warned_of(
+    most: int, warned: bool, make: Make, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    options = make(processes="no")
-    with ExitStack() as stack:
-        resume.save(setup.prepare(options, FakeLearner, stack))
-    monkeypatch.setattr(train_fakes.Counting, attribute, space)
-    with pytest.raises(UserError) as error:
-        run_quietly(options)
-    assert all(word in str(error.value) for word in ["another configuration", *words]), error.value
-
-
-# Options
-
-
-@pytest.mark.parametrize("task", ["kinds:Kinds", "gym:FrozenLake-v1", "dmc:cartpole-balance"])
-def test_arguments_that_nobody_takes_are_named(task: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    if task.startswith("dmc"):
-        pytest.importorskip("dm_control")
     monkeypatch.setitem(sys.modules, "kinds", sys.modules[__name__])
-    with pytest.raises(UserError, match=r"does not take these arguments \(--env-arg wings=2\)"):
-        make_env(task, env_args={"wings": 2})
+    monkeypatch.setattr(Codes, "most", most)
+    run_quietly(make(task="kinds:Codes", steps=4, image_size=16, processes="no"))
+    line = f"WARNING: observation observation: the first images hold no number above {most} of 255; if its numbers are codes"
+    assert (line in capsys.readouterr().out) == warned
 
 
-def test_arguments_reach_the_environment() -> None:
-    pytest.importorskip("dm_control")
-    assert make_env("gym:FrozenLake-v1", env_args={"map_name": "8x8"}).spaces.observations == {"observation": Discrete((64,))}
-    env = make_env("dmc:cartpole-balance", env_args={"time_limit": 0.1})
-    env.reset(seed=0)
-    assert [env.step(F4([0]))[3] for _ in range(10)] == [False] * 9 + [True]
+# The document
+
+DOCUMENT = (ROOT / "docs" / "environments.md").read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize(
-    ("task", "action", "action_repeat", "steps"),
-    [
-        ("gym:MountainCar-v0", [0, 1, 0], 1, 250),  # longer than the registered limit of 200
-        ("gym:MountainCar-v0", [0, 1, 0], 4, 63),
-        ("train_fakes:Endless", [0, 0], 1, 250),
-        ("train_fakes:Endless", [0, 0], 3, 84),
-    ],
-)
-@pytest.mark.covers("LOOP-28")
-def test_a_time_limit_counts_frames_whatever_the_task(task: str, action: list[float], action_repeat: int, steps: int) -> None:
-    env = make_env(task, action_repeat=action_repeat, time_limit=250)
-    env.reset(seed=0)
-    ends = [env.step(F4(action))[2:4] for _ in range(steps)]
-    assert ends == [(False, False)] * (steps - 1) + [(False, True)]
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```$", DOCUMENT, re.MULTILINE | re.DOTALL)
 
 
-# DeepMind's suite
-
-STEPPED = """
-import sys
-import numpy as np
-from train.envs import make_env
-for task in sys.argv[1:]:
-    env, rng = make_env(f"dmc:{task}"), np.random.default_rng(0)
-    env.reset(seed=0)
-    total = 0.0
-    for _ in range(30):
-        _, reward, *_ = env.step(rng.uniform(-1, 1, env.spaces.action_size).astype(np.float32))
-        total += reward
-    env.reset()
-    env.close()
-    assert -1 <= total <= 31, (task, total)
-    print(task)
-"""
+def test_the_commands_of_the_document_are_understood() -> None:
+    commands = [shlex.split(line, comments=True) for block in blocks("sh") for line in block.splitlines()]
+    assert [command[0] for command in commands] == ["train"] * 4
+    given = [parse(command[1:]) for command in commands]
+    assert given[0].observations == ("arm_*", "camera")
+    assert given[1].leave_out == ("debug_*",)
+    assert given[2].env_args == {"is_slippery": False, "map_name": "8x8"}
+    assert make_env(given[2].task, env_args=given[2].env_args).spaces.observations == {"observation": Discrete((64,))}
+    assert given[3].time_limit == 200
 
 
-def step_all(tasks: list[str]) -> None:
-    """In a process that has not chosen a renderer yet."""
-    environment = {name: value for name, value in os.environ.items() if name not in ("MUJOCO_GL", "DISPLAY")}
-    done = subprocess.run([sys.executable, "-c", STEPPED, *tasks], cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
-    assert done.stdout.split() == tasks, done.stderr
+def test_the_lines_of_the_document_are_what_is_said() -> None:
+    observations = gym.Dict({"board": gym.Box(0, 2, (9, 9), np.int8), "camera": gym.Box(0, 255, (120, 160, 3), U1)})
+    actions = gym.Dict({"steer": gym.Box(-1, 1, (1,)), "throttle": gym.Box(0, np.inf, (1,))})
+    assert "\n".join(translate(observations, actions).lines) + "\n" == blocks("text")[0]
 
 
-@pytest.mark.covers("LOOP-58")
-def test_every_task_of_the_suite() -> None:
-    """Returns of 30 random steps are sane: rewards lie in [0, 1], but for the costs of lqr."""
-    suite = pytest.importorskip("dm_control.suite")
-    tasks = ["-".join(task) for task in suite.ALL_TASKS]
-    assert "lqr-lqr_2_1" in tasks
-    assert len(tasks) >= 50
-    step_all([task for task in tasks if task != "quadruped-escape"])
+def test_the_wrapper_of_the_document_gives_a_range(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Valve(train_fakes.Counting):
+        action_space = gym.Box(0, np.inf, (1,), F4)
 
-
-@pytest.mark.skipif(not ctypes.util.find_library("EGL"), reason="needs EGL")
-def test_a_task_that_renders_from_vectors_too() -> None:
-    pytest.importorskip("dm_control")
-    step_all(["quadruped-escape"])
-
-
-@pytest.mark.parametrize("renderer", ["disabled", "glfw", "no_such_library"])
-@pytest.mark.parametrize("task", ["dmc_vision:cartpole-balance", "dmc:quadruped-escape"])
-def test_a_renderer_that_does_not_work_is_named(task: str, renderer: str, tmp_path: Path) -> None:
-    pytest.importorskip("dm_control")
-    environment = {name: value for name, value in os.environ.items() if name != "DISPLAY"} | {"MUJOCO_GL": renderer}
-    command = [sys.executable, "-m", "train", "--backend", "torch", "--task", task, "--logdir", str(tmp_path / "run"), "--processes", "no"]
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 2
-    last = done.stderr.splitlines()[-1]
-    assert last.startswith(f"train: error: task {task} needs to render, and with MUJOCO_GL set to {renderer} dm_control cannot")
-    assert "set MUJOCO_GL to egl" in last
-    assert "Traceback" not in done.stderr
+    monkeypatch.setitem(sys.modules, "my_module", types.ModuleType("my_module"))
+    monkeypatch.setitem(gymnasium.registry, "Valve-v0", gymnasium.envs.registration.EnvSpec("Valve-v0", Valve))
+    scope: dict[str, Any] = {}
+    exec(blocks("python")[0], scope)
+    env = ContractEnv(scope["make_env"](), "t")
+    assert not [line for line in env.translation.lines if line.startswith("WARNING")]
+    assert env.translation.action(F4([1])).tolist() == [40]

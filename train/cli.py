@@ -42,6 +42,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             command = importlib.import_module(f"train.commands.{arguments[0]}")
             return command.main(arguments[1:])
         options = parse(arguments)
+        if sys.platform == "win32":
+            raise UserError("training does not run on Windows, whose files the replay buffer cannot use; it runs there in WSL 2")
         from train import loop  # Only now: `--help` and mistakes in options shall not wait for Gymnasium.
 
         return 0 if loop.run(options) else 130

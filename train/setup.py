@@ -12,7 +12,7 @@ from train import checkpoint, resume
 from train.about import write_about
 from train.backend import Learner, learner_class
 from train.checkpoint import Checkpoint
-from train.envs import Environments, Record, env_maker, is_slow
+from train.envs import Environments, Record, doubts, env_maker, is_slow
 from train.errors import UserError
 from train.evaluation import play_randomly
 from train.logger import Display, Logger
@@ -68,6 +68,8 @@ def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -
         record=_begin(options, envs, starts) if record is None else record,
         carry=agent.initial_carry(envs.count),
     )
+    for line in doubts(envs.spaces, run.record):
+        display.say(line)
     display.say(
         f"{options.task}: {options.backend} on {run.learner.device}, {parameters:,} parameters, {envs.count} environments, "
         f"seed {options.seed}; logs in {options.logdir}"

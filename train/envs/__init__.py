@@ -3,7 +3,7 @@
 from train.envs.adapter import ContractEnv
 from train.envs.factory import env_maker, make_env
 from train.envs.history import History
-from train.envs.spaces import random_actions, translate
+from train.envs.spaces import doubts, random_actions, translate
 from train.envs.stream import Failure
 from train.envs.vector import Environments, Record, is_slow
 from train.translation import Translation
@@ -15,6 +15,7 @@ __all__ = [
     "History",
     "Record",
     "Translation",
+    "doubts",
     "env_maker",
     "is_slow",
     "make_env",

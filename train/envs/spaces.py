@@ -6,7 +6,7 @@ space that is neither gets the key `observation` or `action`.
 
 import fnmatch
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -85,6 +85,16 @@ def random_actions(spaces: Spaces, rng: np.random.Generator, count: int) -> np.n
         else:
             parts += [np.eye(classes)[rng.integers(classes, size=count)] for classes in space.classes]
     return np.concatenate(parts, axis=1, dtype=np.float32)
+
+
+def doubts(spaces: Spaces, record: Mapping[str, np.ndarray]) -> list[str]:
+    """Lines about images that hold codes, going by the first records [N, ...] of a run: [LOOP-61]."""
+    highest = {key: int(record[key].max()) for key in spaces.images}
+    return [
+        f"WARNING: observation {key}: the first images hold no number above {most} of 255; {CODES}"
+        for key, most in highest.items()
+        if 0 < most < MOST_CODES
+    ]
 
 
 # Keys

@@ -14,7 +14,6 @@ import errno
 import json
 import mmap
 import os
-import resource
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -90,6 +89,8 @@ class ChunkStore:
         self.directory, self.shape, self.memory_limit = directory, shape, memory_limit
         self._open: collections.OrderedDict[int, OpenChunk] = collections.OrderedDict()
         self._spare: list[Path] = []
+        import resource  # Not on Windows, where `train eval` needs this module too.
+
         descriptors = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
         # A mapping holds a descriptor too, and half of them stay free for others.
         self._most_open = max(1, min(memory_limit // shape.file_bytes, max(descriptors, 64) // 4))
