@@ -123,7 +123,10 @@ from train.policy import Policy
 policy = Policy.load(sys.argv[1])
 policy.reset({ROWS}, seed=5)
 for step in range(2):
-    action = policy(dict(np.load(sys.argv[2])), [step == 0] * {ROWS})
+    given = dict(np.load(sys.argv[2]))
+    raw = [{{key: value[row] for key, value in given.items()}} for row in range({ROWS})]
+    action = policy(policy.observation(raw), [step == 0] * {ROWS})
+    policy.environment_action(action)
 assert not set({WITHOUT!r}) & set(sys.modules)
 np.save(sys.argv[3], action)
 """

@@ -55,3 +55,26 @@ def test_what_needs_no_buffer_runs_without_posix(tmp_path: Path) -> None:
     subprocess.run(
         [sys.executable, "-c", WITHOUT_POSIX + POLICY, *lines], check=True, cwd=tmp_path, env={"PYTHONPATH": str(ROOT), "PATH": ""}
     )
+
+
+WITHOUT_PILLOW = """
+import sys
+sys.modules["PIL"] = None
+import gymnasium
+import numpy as np
+from train.envs import ContractEnv
+
+class Camera(gymnasium.Env):
+    observation_space = gymnasium.spaces.Box(0, 255, (120, 160, 3), np.uint8)
+    action_space = gymnasium.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        return np.full((120, 160, 3), 9, np.uint8), {}
+
+observation, _ = ContractEnv(Camera(), "camera").reset()
+assert observation["observation"].shape == (64, 64, 3) and (observation["observation"] == 9).all()
+"""
+
+
+def test_environments_need_gymnasium_and_numpy_only() -> None:
+    subprocess.run([sys.executable, "-c", WITHOUT_PILLOW], check=True, env={"PYTHONPATH": str(ROOT), "PATH": ""})

@@ -11,6 +11,7 @@ Keyword arguments (--env-arg) go to gymnasium.make, to the suite as task_kwargs,
 import functools
 import importlib
 import sys
+import traceback
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -63,15 +64,13 @@ def make_env(
             env = _make_own(task, suite, name, given)
     except TypeError as error:
         if given and "argument" in str(error):
-            raise UserError(f"task {task} does not take these arguments (--env-arg {_shown(given)}): {error}") from error
+            shown = ", ".join(f"{name}={value!r:.40}" for name, value in given.items())
+            message = f"task {task} does not take these arguments (--env-arg {shown}): {error}"
+            raise UserError(message, traceback.format_exc()) from error
         raise
     if time_limit is not None and suite != "gym":
         env = gymnasium.wrappers.TimeLimit(env, time_limit)
     return ContractEnv(env, task, index, image_size, action_repeat, observations, leave_out)
-
-
-def _shown(arguments: Mapping[str, Any]) -> str:
-    return ", ".join(f"{name}={value!r:.40}" for name, value in arguments.items())
 
 
 def _make_gymnasium(task: str, name: str, arguments: dict[str, Any]) -> gymnasium.Env[Any, Any]:
