@@ -12,6 +12,7 @@ from spec import Image, Spaces, Vector, load_config
 from train.machine import describe
 from train.policy import Policy
 from train.saved_agent import SavedAgent, acting_table
+from train.translation import Entry, Translation
 
 OBSERVATIONS = {"vector": Vector(24), "image of 32 x 32": Image(32, 32, 3), "image of 64 x 64": Image(64, 64, 3)}
 REPEATS, SECONDS = 5, 0.5
@@ -23,7 +24,7 @@ def rate(size: str, observed: str, rows: int) -> float:
     spaces = Spaces({"observation": space}, {"action": Vector(6)})
     rng, config = np.random.default_rng(0), load_config("paper", size)
     parameters = {name: rng.normal(0, 0.05, entry.shape).astype(np.float32) for name, entry in acting_table(config, spaces).items()}
-    policy = Policy(SavedAgent(config, spaces, parameters, {}))
+    policy = Policy(SavedAgent(config, spaces, parameters, {}, _translation(spaces)))
     policy.reset(rows)
     shape, is_first = (rows, *space.array_shape), np.zeros(rows, bool)
     value = rng.integers(0, 256, shape).astype(np.uint8) if isinstance(space, Image) else rng.normal(size=shape)
@@ -35,6 +36,12 @@ def rate(size: str, observed: str, rows: int) -> float:
             steps += 1
         rates.append(rows * steps / (time.process_time() - start))
     return max(rates)
+
+
+def _translation(spaces: Spaces) -> Translation:
+    (observed,) = spaces.observations.values()
+    entry = Entry((), observed.array_shape, "uint8", (0.0,), (255.0,)) if isinstance(observed, Image) else Entry((), (24,), "float32")
+    return Translation(spaces, {"observation": entry}, {"action": Entry((), (6,), "float32", (-1.0,), (1.0,))})
 
 
 def main() -> None:

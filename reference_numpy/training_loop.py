@@ -149,12 +149,13 @@ def environment_action(action: Any, spaces: Spaces, low: Mapping[str, Any], high
 
 
 def _rescale(part: NDArray[Any], low: NDArray[Any], high: NDArray[Any]) -> NDArray[Any]:
-    """[-1, 1] to the bounds, where a dimension has two finite ones."""
+    """[-1, 1] to the range of each dimension: between its bounds, 2 wide at the only one, or as it is where there is none."""
     clipped = np.clip(part, -1.0, 1.0)
-    finite = np.isfinite(low) & np.isfinite(high)
-    lowest, highest = np.where(finite, low, -1.0), np.where(finite, high, 1.0)
-    rescaled = lowest + (clipped + 1.0) / 2.0 * (highest - lowest)
-    bounded: NDArray[Any] = np.clip(np.where(finite, rescaled, clipped), low, high)
+    below, above = np.isfinite(low), np.isfinite(high)
+    with np.errstate(invalid="ignore"):  # Not taken where it is infinite.
+        lowest, highest = np.where(below, low, high - 2.0), np.where(above, high, low + 2.0)
+        rescaled = np.clip(lowest + (clipped + 1.0) / 2.0 * (highest - lowest), lowest, highest)
+    bounded: NDArray[Any] = np.where(below | above, rescaled, clipped)
     return bounded
 
 

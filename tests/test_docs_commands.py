@@ -89,7 +89,19 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with (folder / "my_dreamer.py").open("a") as file:
         file.write("losses.lambda_return = returns.lambda_return\n")
     (folder / "my_module.py").write_text(
-        "import gymnasium\n\n\ndef make_env(level=1, goals=()):\n    return gymnasium.make('CartPole-v1')\n"
+        """import gymnasium
+from gymnasium import spaces
+
+
+def make_env(level=1, goals=()):
+    def seen(observation):
+        return {"arm_angle": observation, "camera": observation[:2], "debug_time": observation[:1]}
+
+    cartpole = gymnasium.make("CartPole-v1")
+    box = cartpole.observation_space
+    parts = {"arm_angle": box, "camera": spaces.Box(box.low[:2], box.high[:2]), "debug_time": spaces.Box(box.low[:1], box.high[:1])}
+    return gymnasium.wrappers.TransformObservation(cartpole, seen, spaces.Dict(parts))
+"""
     )
     (folder / "expected.toml").write_text("")
     (folder / "bin").mkdir()

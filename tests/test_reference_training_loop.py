@@ -98,7 +98,7 @@ def test_environment_action():
     flat = [0.0, 1.0, 0.0, 0.0, 1.0, 0.5, -1.7, -0.25, 1.7]  # keys in sorted order: buttons, turn
     result = environment_action(flat, SPACES, low, high)
     assert result["buttons"].tolist() == [1, 2]
-    assert result["turn"].tolist() == [7.5, -1.0, 0.0, 2.0]
+    assert result["turn"].tolist() == [7.5, -1.0, 0.75, 2.0]
     batch = environment_action(np.stack([flat, flat]), SPACES, low, high)
     assert batch["buttons"].shape == (2, 2)
     assert batch["turn"].shape == (2, 4)
@@ -107,6 +107,8 @@ def test_environment_action():
 def test_environment_action_is_within_bounds_and_identity_without():
     spaces = Spaces({"x": Vector(1)}, {"a": Vector(1)})
     assert environment_action([1.0], spaces, {"a": [0.1]}, {"a": [0.3]})["a"][0] == 0.3
+    assert environment_action([-5.0], spaces, {"a": [3.0]}, {"a": [np.inf]})["a"][0] == 3.0
+    assert environment_action([0.5], spaces, {"a": [-np.inf]}, {"a": [3.0]})["a"][0] == 2.5
     assert environment_action([1e-20], spaces, {"a": [-np.inf]}, {"a": [np.inf]})["a"][0] == 1e-20
     assert environment_action([0.0, 0.0], Spaces({"x": Vector(1)}, {"a": Discrete((2,))}), {}, {})["a"].tolist() == [0]
 

@@ -6,7 +6,6 @@ import subprocess
 import sys
 from typing import Any
 
-import numpy as np
 import pytest
 
 from spec import Image, Spaces
@@ -24,7 +23,7 @@ for task in sys.argv[1:] or [f"dmc:{domain}-{name}" for domain, name in __import
         env = make_env(task, image_size=16)
         record = env.reset(seed=0)[0]
         rewards = []
-        for action in random_actions(env.spaces, np.random.default_rng(0), 3):
+        for action in random_actions(env.spaces, np.random.default_rng(0), 30):
             record, reward, terminated, truncated, _ = env.step(action)
             rewards.append(reward)
         shapes = {key: list(value.shape) for key, value in record.items()}
@@ -45,6 +44,7 @@ def stepped(*tasks: str, **environment: str) -> list[dict[str, Any]]:
     return [json.loads(line) for line in result.stdout.splitlines()]
 
 
+@pytest.mark.covers("LOOP-58")
 def test_every_task_of_the_suite_steps_without_a_graphics_library() -> None:
     """quadruped-escape included, which would upload its terrain to one."""
     results = stepped(MUJOCO_GL="disabled")
@@ -53,9 +53,9 @@ def test_every_task_of_the_suite_steps_without_a_graphics_library() -> None:
         assert "error" not in result, result
         spaces = Spaces.from_json(result["spaces"])
         assert {key: list(space.array_shape) for key, space in spaces.observations.items()} == result["shapes"]
-        assert np.isfinite(result["rewards"]).all()
+        assert -1 <= sum(result["rewards"]) <= 31, result  # rewards lie in [0, 1], but for the costs of lqr
         assert not result["end"], result
-        assert len(result["rewards"]) == 3
+        assert len(result["rewards"]) == 30
 
 
 @pytest.mark.parametrize("task", ["dmc:quadruped-escape", "dmc:lqr-lqr_2_1", "dmc:humanoid-stand"])

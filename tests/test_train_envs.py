@@ -52,13 +52,17 @@ def test_action_spaces(space: gymnasium.Space, expected: object) -> None:
     ("observation", "action", "words"),
     [
         (gym.Dict({"text": gym.Text(5)}), TWO, ["observation 'text'", "Text"]),
-        (gym.Dict({"a": gym.Dict({"b": gym.Tuple([TWO])})}), TWO, ["observation 'a_b'", "Tuple"]),
-        (gym.Box(0, 255, (3, 64, 64), np.uint8), TWO, ["channels first"]),
+        (gym.Dict({"a": gym.Tuple([TWO, gym.Sequence(TWO)])}), TWO, ["observation 'a_1'", "Sequence"]),
         (gym.Dict({"a": gym.Dict({"b": TWO}), "a_b": TWO}), TWO, ["'a_b'", "rename"]),
+        (gym.Dict({"a": gym.Tuple([TWO]), "a_0": TWO}), TWO, ["'a_0'", "rename"]),
         (gym.Dict({"reward": TWO}), TWO, ["'reward'", "reserved"]),
-        (gym.Dict({}), TWO, ["at least one observation"]),
+        (gym.Dict({}), TWO, ["observation 'observation'", "Dict()"]),
+        (TWO, gym.Tuple([TWO, gym.Dict({})]), ["action '1'", "Dict()"]),
         (gym.Box(0, 1, (0,)), TWO, ["'observation'"]),
-        (TWO, gym.Box(0, 5, (2,), np.int32), ["action 'action'", "floats"]),
+        (TWO, gym.Box(0, 500, (2,), np.int32), ["action 'action'", "at most 256", "Box of floats"]),
+        (gym.Discrete(2**62), TWO, ["'observation'", "one-hots", "Box"]),
+        (TWO, gym.MultiBinary(50_000), ["action 'action'", "32,768 choices"]),
+        (TWO, gym.Dict({7: TWO}), ["action '7'", "strings"]),
     ],
 )
 def test_unsupported_spaces_are_named(observation: gymnasium.Space, action: gymnasium.Space, words: list[str]) -> None:

@@ -219,7 +219,16 @@ def same(one: SavedAgent, other: SavedAgent) -> bool:
     arrays = zip(one.parameters.items(), other.parameters.items(), strict=True)
     equal = all(name == other_name and a.tobytes() == b.tobytes() for (name, a), (other_name, b) in arrays)
     info = [{name: value for name, value in agent.info.items() if name != "source"} for agent in (one, other)]
-    return equal and info[0] == info[1] and (one.config, one.spaces) == (other.config, other.spaces)
+    return (
+        equal
+        and info[0] == info[1]
+        and (one.config, one.spaces, one.translation)
+        == (
+            other.config,
+            other.spaces,
+            other.translation,
+        )
+    )
 
 
 def act(policy: Policy) -> None:
@@ -229,7 +238,10 @@ def act(policy: Policy) -> None:
     try:
         with np.errstate(all="ignore"):
             for first in (True, False):
-                assert np.isfinite(policy(observation, [first, True])).all()
+                action = policy(observation, [first, True])
+                assert np.isfinite(action).all()
+                policy.environment_action(action)
+            policy.observation([{key: value[row] for key, value in observation.items()} for row in range(2)])
     except ValueError:
         pass
 
@@ -247,7 +259,7 @@ def load_policy(folder: Path) -> SavedAgent:
     policy = Policy.load(folder)
     act(policy)
     parameters = {name: array.astype(np.float32) for name, array in policy._parameters.items()}
-    return SavedAgent(policy.config, policy.spaces, parameters, dict(policy.info))
+    return SavedAgent(policy.config, policy.spaces, parameters, dict(policy.info), policy.translation)
 
 
 @dataclasses.dataclass(frozen=True)

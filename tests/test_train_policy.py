@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from gymnasium import spaces as gym
 from safetensors.numpy import load_file
 from train_agents import random_learner_state, save_checkpoint
 
@@ -19,6 +20,7 @@ from conformance.problems import action_noise, random_observations, small_config
 from reference_numpy.training_loop import derive_seed
 from spec import Discrete, Image, Spaces, Vector, load_config
 from train.cli import main
+from train.envs import translate
 from train.errors import UserError
 from train.policy import Policy
 
@@ -74,7 +76,7 @@ def test_a_policy_holds_what_acting_needs_and_nothing_else(checkpoint: Path, fol
 def test_a_policy_says_what_it_is_and_where_it_comes_from(checkpoint: Path, folder: Path) -> None:
     info = json.loads((folder / "policy.json").read_text())
     named = {name: info[name] for name in ("format", "task", "step", "backend", "action_repeat", "image_size")}
-    assert named == {"format": 1, "task": "gym:Robot-v0", "step": 1000, "backend": "jax", "action_repeat": 2, "image_size": 16}
+    assert named == {"format": 2, "task": "gym:Robot-v0", "step": 1000, "backend": "jax", "action_repeat": 2, "image_size": 16}
     assert info["source"] == {"checkpoint": str(checkpoint), "seed": 3, "train_steps": 10}
     assert set(info["versions"]) == {"dreamer-spec", "python", "numpy"}
     assert info["spaces"]["actions"]["buttons"] == {"kind": "discrete", "classes": [2, 3]}
@@ -123,7 +125,10 @@ from train.policy import Policy
 policy = Policy.load(sys.argv[1])
 policy.reset({ROWS}, seed=5)
 for step in range(2):
-    action = policy(dict(np.load(sys.argv[2])), [step == 0] * {ROWS})
+    given = dict(np.load(sys.argv[2]))
+    raw = [{{key: value[row] for key, value in given.items()}} for row in range({ROWS})]
+    action = policy(policy.observation(raw), [step == 0] * {ROWS})
+    policy.environment_action(action)
 assert not set({WITHOUT!r}) & set(sys.modules)
 np.save(sys.argv[3], action)
 """
@@ -204,10 +209,24 @@ def test_the_caller_may_write_into_an_action(policy: Policy, folder: Path) -> No
 @pytest.mark.covers("LOOP-12")
 def test_what_the_environment_receives(policy: Policy) -> None:
     flat = [[0.5, -7.0, 0, 1, 0, 0, 1]]
-    taken = policy.environment_action(flat, low={"arm": [0, -1]}, high={"arm": [10, np.inf]})
-    assert {key: value.tolist() for key, value in taken.items()} == {"arm": [[7.5, -1.0]], "buttons": [[1, 2]]}
-    with pytest.raises(ValueError, match=r"low: the action 'arm' needs bounds of shape \[2\], got the keys \[\]"):
-        policy.environment_action(flat)
+    (taken,) = policy.environment_action(flat)
+    assert {key: value.tolist() for key, value in taken.items()} == {"arm": [0.5, -1.0], "buttons": [1, 2]}
+    with pytest.raises(ValueError, match=r"action: expected shape \[\.\.\., 7\], got \[1, 6\]"):
+        policy.environment_action([flat[0][:6]])
+    with pytest.raises(ValueError, match="not finite"):
+        policy.environment_action([[np.nan, *flat[0][1:]]])
+
+
+@pytest.mark.covers("LOOP-68")
+def test_what_the_environment_returns_is_what_the_policy_sees(policy: Policy) -> None:
+    raw = [{key: value[row] for key, value in observation().items()} for row in range(ROWS)]
+    seen = policy.observation(raw)
+    assert {key: (value.tobytes(), value.shape) for key, value in seen.items()} == {
+        key: (np.asarray(value, seen[key].dtype).tobytes(), value.shape) for key, value in observation().items()
+    }
+    raw[1] = {**raw[1], "position": np.full(3, np.nan)}
+    with pytest.raises(ValueError, match="'position' holds nan"):
+        policy.observation(raw)
 
 
 WRONG = [
@@ -293,10 +312,9 @@ sys.meta_path.insert(0, Missing())
 def robot_policy(folder: Path, side: int) -> None:
     """A policy for the robot of the document's example, with images of this side."""
     config = load_config("paper", "tiny", compute_dtype="float32")
-    task = Spaces(
-        {"camera": Image(side, side, 3), "joints": Vector(5), "tool": Discrete((3,))}, {"torque": Vector(5), "grip": Discrete((2,))}
-    )
-    run = save_checkpoint(folder / "run", config, task, task="gym:Robot-v0", image_size=side)
+    seen = {"camera": gym.Box(0, 255, (64, 64, 3), np.uint8), "joints": gym.Box(-np.pi, np.pi, (5,)), "tool": gym.Discrete(3)}
+    task = translate(gym.Dict(seen), gym.Dict({"torque": gym.Box(-2, 2, (5,)), "grip": gym.Discrete(2)}), side)
+    run = save_checkpoint(folder / "run", config, task.spaces, translation=task, task="gym:Robot-v0", image_size=side)
     assert main(["export", str(run), str(folder / "policy")]) == 0
 
 
@@ -306,21 +324,16 @@ def run_alone(example: str, folder: Path) -> "subprocess.CompletedProcess[str]":
     return subprocess.run(command, check=False, capture_output=True, text=True, env=environment, cwd=folder)
 
 
-def test_the_example_of_the_document_runs_with_numpy_and_gymnasium_alone(tmp_path: Path) -> None:
+@pytest.mark.parametrize("side", [64, 32])
+def test_the_example_of_the_document_runs_with_numpy_and_gymnasium_alone(tmp_path: Path, side: int) -> None:
+    """Images of another size are resized as well."""
     (example,) = blocks("python")
-    robot_policy(tmp_path, 64)
+    robot_policy(tmp_path, side)
     done = run_alone(example, tmp_path)
     assert not done.stderr
     score = re.fullmatch(r"return (\d+)\n", done.stdout)
     assert score
     assert 0 <= int(score[1]) <= 20
-
-
-def test_only_resizing_an_image_needs_pillow_and_says_so(tmp_path: Path) -> None:
-    (example,) = blocks("python")
-    robot_policy(tmp_path, 32)
-    error = run_alone(example, tmp_path).stderr.splitlines()[-1]
-    assert "resizing an image of 64 x 64 pixels to 32 x 32 needs Pillow: pip install pillow" in error
 
 
 def test_the_commands_of_the_document_run(cartpole: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,10 +8,11 @@ import numpy as np
 
 from conformance.problems import random_state
 from reference_numpy.agent import flatten_state
-from spec import Config, Spaces
+from spec import Config, Discrete, Image, Spaces, Vector
 from train import checkpoint
 from train.options import Options
 from train.state import Counters
+from train.translation import Entry, Target, Translation
 
 
 def random_learner_state(config: Config, spaces: Spaces, seed: int = 0) -> dict[str, np.ndarray]:
@@ -19,12 +20,42 @@ def random_learner_state(config: Config, spaces: Spaces, seed: int = 0) -> dict[
     return flatten_state(random_state(np.random.default_rng(seed), config, spaces, "float32"))
 
 
-def save_checkpoint(logdir: Path, config: Config, spaces: Spaces, *, backend: str = "jax", seed: int = 0, **given: Any) -> Path:
-    """Writes a checkpoint at step 1000. given: fields of Options."""
+def plain_translation(spaces: Spaces) -> Translation:
+    """Of a task whose values have the form of the spaces already: a Dict, or where a key is `observation` or `action` that alone."""
+
+    def entry(key: str, space: Target, acts: bool) -> Entry:
+        path = () if key in ("observation", "action") else (key,)
+        match space:
+            case Discrete(classes):
+                return Entry(path, () if len(classes) == 1 else space.array_shape, "int64", (0,), (), len(classes) == 1)
+            case Vector():
+                return Entry(path, space.array_shape, "float32", *(((-1.0,), (1.0,)) if acts else ()))
+            case Image():
+                return Entry(path, space.array_shape, "uint8", (0.0,), (255.0,))
+
+    return Translation(
+        spaces,
+        {key: entry(key, space, False) for key, space in spaces.observations.items()},
+        {key: entry(key, space, True) for key, space in spaces.actions.items()},
+    )
+
+
+def save_checkpoint(
+    logdir: Path,
+    config: Config,
+    spaces: Spaces,
+    *,
+    backend: str = "jax",
+    seed: int = 0,
+    translation: Translation | None = None,
+    **given: Any,
+) -> Path:
+    """Writes a checkpoint at step 1000. translation: `plain_translation` without it. given: fields of Options."""
     options = Options(backend=backend, config=config, logdir=logdir, steps=1000, seed=seed, **given)
     info = {
         "identity": options.identity(),
         "spaces": spaces.to_json(),
+        "translation": (translation or plain_translation(spaces)).to_json(),
         "backend": backend,
         "counters": dataclasses.asdict(Counters(records=1000 // options.action_repeat, train_steps=10)),
     }

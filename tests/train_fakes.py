@@ -274,7 +274,7 @@ class Maze(gymnasium.Env[Any, Any]):
 
     observation_space = gym.Dict(
         {
-            "view": gym.Box(0, 255, (8, 8, 3), np.uint8),
+            "view": gym.Box(0, 255, (16, 20, 3), np.uint8),
             "body": gym.Dict({"place": gym.Discrete(7), "speed": gym.Box(-np.inf, np.inf, (2,), np.float64)}),
         }
     )
@@ -292,7 +292,7 @@ class Maze(gymnasium.Env[Any, Any]):
         return self._observation(), float(self._speed.sum()), self.np_random.random() < 0.05, self._time == 12, {}
 
     def _observation(self) -> dict[str, Any]:
-        view = self.np_random.integers(0, 256, (8, 8, 3), np.uint8)
+        view = self.np_random.integers(0, 256, (16, 20, 3), np.uint8)
         return {"view": view, "body": {"place": np.int64(self._place), "speed": self._speed}}
 
 

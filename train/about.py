@@ -6,7 +6,7 @@ import json
 import os
 import secrets
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -36,6 +36,7 @@ def write_about(
     resumed_at: int | None,
     given_anew: Mapping[str, Any] | None = None,
     origin: Mapping[str, Any] | None = None,
+    understood: Sequence[str] = (),
 ) -> About:
     """Writes LOGDIR/run.json, complete or not at all, and returns what stands there.
 
@@ -43,6 +44,7 @@ def write_about(
     the environment step of the checkpoint that is continued, None for a new run. given_anew: name -> [value before, value from here on] of
     what a resumed run was given anew. origin: where the parameters of a new run come from, if not from its seed. A resumed run keeps its
     `id`, its `origin` and its earlier `starts`; all else describes this start.
+    understood: what the environment's spaces became, in words.
 
     Raises:
       UserError: the disk refuses it.
@@ -75,6 +77,7 @@ def write_about(
         "hyperparameters": dataclasses.asdict(options.config),
         "changed_hyperparameters": changed,
         "spaces": spaces.to_json(),
+        "understood": list(understood),
         "preflight": dataclasses.asdict(preflight) if preflight else None,
         "machine": machine,
         "starts": [*(starts if isinstance(starts, list) else []), start],
@@ -110,7 +113,7 @@ def write_json(path: Path, value: About) -> About:
 def command_line(options: Options) -> list[str]:
     """The words of a command that gives these options, whatever the presets are."""
     profile, size, changed = nearest(options.config)
-    defaults = {field.name: field.default for field in dataclasses.fields(options)} | presets()["base"]
+    defaults = {field.name: field.default for field in dataclasses.fields(options)} | {"env_args": {}} | presets()["base"]
     words = ["train", "--backend", options.backend, "--task", options.task, "--profile", profile, "--size", size]
     for field in dataclasses.fields(options):
         value = getattr(options, field.name)
@@ -120,7 +123,7 @@ def command_line(options: Options) -> list[str]:
         if isinstance(value, bool):
             words.append(f"--{flag}" if value else f"--no-{flag}")
         else:
-            words += [f"--{flag}", str(value)]
+            words += [f"--{flag}", _show(value)]
     words += [word for argument in keywords.write(options.env_arg) for word in ("--env-arg", argument)]
     for name, value in changed.items():
         words += [f"--{name.replace('_', '-')}", _show(value)]

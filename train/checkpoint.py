@@ -39,7 +39,7 @@ from train.files import (
 )
 from train.options import may_change
 
-FORMAT = 3
+FORMAT = 4  # Since 4 it says how the environment's values are translated: what a policy made of it needs to act.
 ONCE_COMPLETE = re.compile(r"[0-9]{12}(\.old)?")  # .old: about to be replaced by the same step
 UNFINISHED = re.compile(r"[0-9]{12}(\.old)?\.[0-9a-f]{8}\.tmp")  # being written, or being removed
 FILES = ("learner.safetensors", "loop.safetensors", "run.json")
@@ -232,6 +232,13 @@ def require_same_spaces(checkpoint: Checkpoint, given: Mapping[str, Any]) -> Non
     _require_same(checkpoint, space_entries(checkpoint.info["spaces"]), space_entries(given))
 
 
+def require_same_translation(checkpoint: Checkpoint, given: Mapping[str, Any]) -> None:
+    """Raises:
+    UserError: bounds, dtypes or keys of the task are not those of the checkpoint; the message lists them. [LOOP-64]
+    """
+    _require_same(checkpoint, space_entries(checkpoint.info["translation"]), space_entries(json.loads(json.dumps(given))))
+
+
 def _require_same(checkpoint: Checkpoint, saved: Mapping[str, Any], given: Mapping[str, Any]) -> None:
     found = differences(saved, given)
     if found:
@@ -251,7 +258,8 @@ def differences(saved: Mapping[str, Any], given: Mapping[str, Any]) -> list[str]
 
 def space_entries(spaces: Mapping[str, Any]) -> dict[str, Any]:
     """observations: {x: ...} -> "observations x": ..., so that a difference names one key."""
-    return {f"{kind} {key}": entry for kind, entries in spaces.items() for key, entry in entries.items()}
+    named = {kind: entries if isinstance(entries, dict) else dict(enumerate(entries)) for kind, entries in spaces.items()}
+    return {f"{kind} {key}": entry for kind, entries in named.items() for key, entry in entries.items()}
 
 
 def _show(value: Any) -> str:

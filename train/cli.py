@@ -230,6 +230,10 @@ def add_options(parser: argparse.ArgumentParser, begins: bool = True) -> None:
     )
     envs.add_argument("--action-repeat", type=_whole(1), metavar="N", help="apply each action N times (default 1)")
     envs.add_argument("--image-size", type=_whole(1), metavar="N", help="side to which images are resized, in pixels (default 64)")
+    envs.add_argument(
+        "--observations", type=_words, metavar="KEY,...", help="use only these keys; `*` stands for any letters (default: all)"
+    )
+    envs.add_argument("--leave-out", type=_words, metavar="KEY,...", help="do not use these keys of the observations")
     envs.add_argument("--processes", choices=PROCESSES, help="one process per environment; auto: if its steps are slow (default)")
 
     envs.add_argument(
@@ -378,6 +382,10 @@ def _boolean(text: str) -> bool:
     if text.lower() not in ("true", "false"):
         raise argparse.ArgumentTypeError(f"{text!r} is neither true nor false")
     return text.lower() == "true"
+
+
+def _words(text: str) -> tuple[str, ...]:
+    return tuple(word for word in text.split(",") if word)
 
 
 def _numbers(text: str) -> list[int]:

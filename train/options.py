@@ -27,7 +27,8 @@ class Options:
     """Everything that a run depends on, beside the code.
 
     steps and eval_every are environment steps: records times action_repeat. checkpoint_every, log_every and env_timeout are seconds.
-    replay_memory is in GiB. env_arg: keyword arguments of the environment. time_limit: in frames, that is before action repeat. from_: a
+    replay_memory is in GiB. env_arg: keyword arguments of the environment. time_limit: in frames, that is before action repeat.
+    observations, leave_out: keys or patterns of keys that the agent gets and does not get, all where `observations` is empty. from_: a
     log directory or a checkpoint, whose parameters a new run begins with.
     """
 
@@ -44,6 +45,8 @@ class Options:
     time_limit: int | None = None
     action_repeat: int = 1
     image_size: int = 64
+    observations: tuple[str, ...] = ()
+    leave_out: tuple[str, ...] = ()
     eval_every: int = 0
     eval_episodes: int = 10
     random_episodes: int = 10
@@ -66,10 +69,10 @@ class Options:
 
     def identity(self) -> dict[str, Any]:
         """What was learned depends on, the backend aside: either continues what the other began. See `may_change`."""
-        run = {name: getattr(self, name) for name in ("task", "time_limit", "seed", "action_repeat", "image_size", "replay_deter")}
-        run["env_arg"] = dict(self.env_arg) or None
-        config = {name: list(value) if isinstance(value, tuple) else value for name, value in dataclasses.asdict(self.config).items()}
-        return run | config
+        task = ("task", "time_limit", "action_repeat", "image_size", "observations", "leave_out")
+        values = {name: getattr(self, name) for name in (*task, "seed", "replay_deter")} | dataclasses.asdict(self.config)
+        values["env_arg"] = dict(self.env_arg) or None
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

@@ -2,14 +2,14 @@
 
 policy/
   policy.safetensors   the parameters that acting needs, float32 under their canonical names (spec/10-agent.md)
-  policy.json          format, task, step, spaces, configuration, and where the policy comes from
+  policy.json          format, task, step, spaces and their translation, configuration, and where the policy comes from
   SHA256SUMS           checksums of the other files
 """
 
 import dataclasses
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -24,20 +24,21 @@ from spec import Discrete, Spaces, Vector
 from train.errors import UserError
 from train.files import SUMS, flush, new_folder, open_sealed, remove_folder, require_intact, seal
 from train.saved_agent import SavedAgent, acting_table, check_info, checked_parameters, config_from_json
+from train.translation import Translation
 
-FORMAT = 1
+FORMAT = 2  # Since 2 it holds the translation: before, a caller had to know bounds, first numbers, shapes and dtypes.
 PARAMETERS, DESCRIPTION = "policy.safetensors", "policy.json"
 
 
 class Policy:
     """Acts in `n` environments at once, with a carry of its own for each.
 
-    spaces: what it sees and does. config: its hyperparameters. info: what else policy.json says: task, step, backend, action_repeat,
-    image_size, source, versions.
+    spaces: what it sees and does. translation: what the environment's values become. config: its hyperparameters. info: what else
+    policy.json says: task, step, backend, action_repeat, image_size, environment, source, versions.
     """
 
     def __init__(self, saved: SavedAgent) -> None:
-        self.spaces, self.config, self.info = saved.spaces, saved.config, saved.info
+        self.spaces, self.translation, self.config, self.info = saved.spaces, saved.translation, saved.config, saved.info
         self._parameters = {name: np.asarray(array, np.float64) for name, array in saved.parameters.items()}  # once, not in every step
         self.reset(0)
 
@@ -56,11 +57,12 @@ class Policy:
             if info.get("format") != FORMAT:
                 raise ValueError(f"{DESCRIPTION} has format {info.get('format')!r:.80}; this version reads format {FORMAT}")
             spaces, config = Spaces.from_json(info.pop("spaces", None)), config_from_json(info.pop("config", None))
+            translation = Translation.from_json(info.pop("translation", None), spaces)
             check_info(info, spaces)
             parameters = checked_parameters(sealed.arrays(PARAMETERS), acting_table(config, spaces))
         except (OSError, ValueError) as error:
             raise UserError(f"cannot load the policy {path}: {error!s:.500}; `train export` writes it anew") from error
-        return cls(SavedAgent(config, spaces, parameters, info))
+        return cls(SavedAgent(config, spaces, parameters, info, translation))
 
     def reset(self, n: int, seed: int = 0) -> None:
         """Begins anew in `n` environments. seed: of the noise that the steps from here on draw."""
@@ -74,8 +76,8 @@ class Policy:
         """One step of every environment: [AGT-11] to [AGT-13], [LOOP-71].
 
         Args:
-          observation: key -> [n, ...] as in spec/00-notation.md: Vector real numbers [n, size], Discrete integers [n, len(classes)],
-            Image uint8 [n, height, width, channels]. Other keys are ignored.
+          observation: what `observation` returns: key -> [n, ...] as in spec/00-notation.md: Vector real numbers [n, size], Discrete
+            integers [n, len(classes)], Image uint8 [n, height, width, channels]. Other keys are ignored.
           is_first: [n] bool, where an episode starts: the row forgets what was before.
           noise: {"posterior": [n, S] uniforms, "action": [n, K] uniforms and normals} instead of drawn numbers, see [CON-20].
           mode: the mode of the actor instead of a sample; the latents are sampled all the same.
@@ -104,27 +106,30 @@ class Policy:
         self._carry, self._action, self._steps = carry, action, self._steps + 1
         return action.copy()
 
-    def environment_action(
-        self, action: Any, low: Mapping[str, Any] | None = None, high: Mapping[str, Any] | None = None
-    ) -> dict[str, np.ndarray]:
-        """What the environments receive for flat actions: [LOOP-12].
+    def observation(self, values: Sequence[Any]) -> dict[str, np.ndarray]:
+        """What the policy sees of one observation of each environment, as the environment returned it: [LOOP-68].
+
+        Returns:
+          Key -> [n, ...], the arrays that the agent was trained on.
+
+        Raises:
+          ValueError: what the task's spaces do not allow; the message names the key.
+        """
+        rows = [self.translation.observation(value) for value in values]
+        return {key: np.stack([row[key] for row in rows]) for key in self.spaces.observations}
+
+    def environment_action(self, action: Any) -> list[Any]:
+        """What each environment receives for its flat action, ready for its `step`: [LOOP-12], [LOOP-68].
 
         Args:
           action: [n, A].
-          low, high: key -> bounds [size] of every Vector action, in the environment's units; may be infinite.
-
-        Returns:
-          Key -> [n, size] for a Vector, [n, len(classes)] int64 for a Discrete.
 
         Raises:
-          ValueError: bounds are missing, or a shape does not fit, or a number is not finite.
+          ValueError: a shape does not fit, or a number is not finite.
         """
-        bounds = {"low": low or {}, "high": high or {}}
-        for key, space in self.spaces.actions.items():
-            for name, entries in bounds.items():
-                if isinstance(space, Vector) and key not in entries:
-                    raise ValueError(f"{name}: the action {key!r} needs bounds of shape [{space.size}], got the keys {sorted(entries)}")
-        return training_loop.environment_action(action, self.spaces, **bounds)
+        action = np.asarray(action)
+        require_shape("action", action.shape, ..., self.spaces.action_size)
+        return [self.translation.action(row) for row in action.reshape(-1, self.spaces.action_size)]
 
     def _observation(self, key: str, observation: Mapping[str, Any]) -> np.ndarray:
         space = self.spaces.observations[key]
@@ -161,7 +166,8 @@ def save(path: Path, saved: SavedAgent) -> None:
     if os.path.lexists(path):
         raise UserError(f"{path} exists already; remove it, or choose another folder for the policy")
     temporary = None
-    description = {"format": FORMAT, **saved.info, "spaces": saved.spaces.to_json(), "config": dataclasses.asdict(saved.config)}
+    description = {"format": FORMAT, **saved.info, "spaces": saved.spaces.to_json(), "translation": saved.translation.to_json()}
+    description["config"] = dataclasses.asdict(saved.config)
     acting = {name: saved.parameters[name] for name in acting_table(saved.config, saved.spaces)}
     try:
         temporary = new_folder(path)

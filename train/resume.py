@@ -47,6 +47,7 @@ def save(run: Run) -> Path:
     info = {
         "identity": run.options.identity(),
         "spaces": run.envs.spaces.to_json(),
+        "translation": run.envs.translation.to_json(),
         "backend": run.options.backend,
         "counters": dataclasses.asdict(run.counters),
         "environments": [history and history.to_json() for history in histories],

@@ -14,6 +14,7 @@ from train.checkpoint import Checkpoint
 from train.errors import UserError
 from train.files import Arrays
 from train.machine import own_version
+from train.translation import Translation
 
 INFO = {
     "task": str,
@@ -30,12 +31,16 @@ MOST_LAYERS = 1000  # of a network: no description is believed that would need m
 
 @dataclasses.dataclass(frozen=True)
 class SavedAgent:
-    """parameters: name -> float32 array. info: the entries of INFO; step: environment steps, with action repeat."""
+    """parameters: name -> float32 array. info: the entries of INFO; step: environment steps, with action repeat.
+
+    translation: how values of the environment become arrays of the spaces, and actions the environment's.
+    """
 
     config: Config
     spaces: Spaces
     parameters: Arrays
     info: dict[str, Any]
+    translation: Translation
 
 
 def agent_of(checkpoint: Checkpoint) -> SavedAgent:
@@ -50,6 +55,7 @@ def agent_of(checkpoint: Checkpoint) -> SavedAgent:
             raise ValueError("run.json: expected the objects identity and counters")
         config = config_from_json({name: identity[name] for name in hyperparameters() if name in identity})
         spaces = Spaces.from_json(checkpoint.info.get("spaces"))
+        translation = Translation.from_json(checkpoint.info.get("translation"), spaces)
         info: dict[str, Any] = {name: identity.get(name) for name in ("task", "action_repeat", "image_size")}
         info |= {"env_arg": identity.get("env_arg") or {}, "time_limit": identity.get("time_limit")}
         info |= {"step": counters.get("records"), "backend": checkpoint.info.get("backend"), "versions": versions()}
@@ -57,7 +63,7 @@ def agent_of(checkpoint: Checkpoint) -> SavedAgent:
         check_info(info, spaces)
         info["step"] *= info["action_repeat"]
         trained = {name.removeprefix("params/"): array for name, array in state.items() if name.startswith("params/")}
-        return SavedAgent(config, spaces, checked_parameters(trained, parameter_table(config, spaces)), info)
+        return SavedAgent(config, spaces, checked_parameters(trained, parameter_table(config, spaces)), info, translation)
     except ValueError as error:
         raise UserError(f"the checkpoint {checkpoint.path} does not hold an agent: {error!s:.500}") from error
 

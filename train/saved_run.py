@@ -34,6 +34,7 @@ SCHEMA: dict[str, Any] = {
     "properties": {
         "identity": {"type": "object"},
         "spaces": {"type": "object", "additionalProperties": {"type": "object"}},
+        "translation": _object({"observations": {"type": "object"}, "actions": {"type": "object"}, "left_out": {"type": "array"}}),
         "backend": {"type": "string", "maxLength": 100},
         "counters": _object({name: NUMBER | {"minimum": 0} if kind is float else COUNT for name, kind in Counters.__annotations__.items()}),
         "environments": {"type": "array", "items": {"anyOf": [{"type": "null"}, _object({"seed": COUNT, "episode": COUNT})]}},
@@ -51,7 +52,18 @@ SCHEMA: dict[str, Any] = {
         "replay": {"type": "object"},
     },
     "required": [
-        *("identity", "spaces", "backend", "counters", "environments", "replay_ratio", "random_return", "evaluation", "returns"),
+        *(
+            "identity",
+            "spaces",
+            "translation",
+            "backend",
+            "counters",
+            "environments",
+            "replay_ratio",
+            "random_return",
+            "evaluation",
+            "returns",
+        ),
         *("metrics", "log", "replay"),
     ],
 }

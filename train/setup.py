@@ -1,6 +1,5 @@
 """From options to a run that is ready to start: whatever the user may have got wrong is found here."""
 
-import functools
 import math
 import os
 from contextlib import ExitStack, closing
@@ -15,9 +14,8 @@ from train import checkpoint, logdir, resume, saved_run, threads
 from train.about import write_about
 from train.backend import Learner, learner_class
 from train.checkpoint import Checkpoint
-from train.envs import Environments, Record, make_env, try_out
+from train.envs import Environments, Record, doubts, env_maker, try_out
 from train.envs.frames import repeated_twice
-from train.envs.info import names_of
 from train.errors import UserError
 from train.evaluation import play_randomly, report_failure
 from train.forecast import say_memory
@@ -51,7 +49,10 @@ def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -
         display.say(warning)
     if saved:
         checkpoint.require_same_spaces(saved, envs.spaces.to_json())
+        checkpoint.require_same_translation(saved, envs.translation.to_json())
         require_same_origin(options)
+    for line in envs.translation.lines:
+        display.say(line)
     parameters = _count_parameters(options, envs.spaces)
     say_memory(options, envs.spaces, parameters, display.say)
     agent = make_learner(learner_type, options, envs.spaces)  # Before preflight: it says what is wrong with the device.
@@ -77,6 +78,7 @@ def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -
         resumed_at=step if saved else None,
         given_anew=changed,
         origin=origin,
+        understood=envs.translation.lines,
     )
     logger = Logger(options.logdir, saved.info["log"] if saved else None, wandb=options.wandb, about=about)
     for line in logger.warnings:
@@ -95,6 +97,8 @@ def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -
         record=_begin(options, envs, starts) if record is None else record,
         carry=agent.initial_carry(envs.count),
     )
+    for line in doubts(envs.spaces, run.record):
+        display.say(line)
     display.say(
         f"{options.task}: {options.backend} on {run.learner.device}, {_counted(_threads(options, envs.spaces), 'thread')}, "
         f"{parameters:,} parameters, {_counted(envs.count, 'environment')}, seed {options.seed}; logs in {options.logdir}"
@@ -185,15 +189,7 @@ def import_learner(backend: str) -> type[Learner]:
 
 def _make_environments(options: Options, display: Display, stack: ExitStack) -> tuple[Environments, Environments | None]:
     """The environments of training, and those of evaluation if there is any."""
-    make = functools.partial(
-        make_env,
-        options.task,
-        image_size=options.image_size,
-        action_repeat=options.action_repeat,
-        info_metrics=names_of(options.info_metrics),
-        arguments=options.env_arg,
-        time_limit=options.time_limit,
-    )
+    make = env_maker(options)
     trial = None
     if options.processes != "no":
         display.phase("an environment is tried out")

@@ -125,12 +125,12 @@ def training_starts_with_enough_items(run: Run) -> None:
 
 @check("LOOP-12", "CON-27", uses=["environment_action"], level=0)
 def environment_actions_by_hand(run: Run) -> None:
-    """Indices of choices, numbers clipped and scaled to two finite bounds, clipped where there is one, as they are where there is none."""
+    """Indices of choices, numbers clipped and scaled to the bounds, to a range 2 wide at a single one, as they are where there is none."""
     low, high = {"turn": np.array([0, -np.inf, 0, -2])}, {"turn": np.array([10, np.inf, np.inf, 2])}
     flat = np.array([0, 1, 0, 0, 1, 0.5, -1.7, -0.25, 1.7])  # keys in sorted order: buttons, turn
     result = run.call("environment_action", flat, TASK, low, high)
     run.exact("buttons", result["buttons"], [1, 2])
-    run.exact("turn", result["turn"], [7.5, -1, 0, 2])
+    run.exact("turn", result["turn"], [7.5, -1, 0.75, 2])
     run.holds("exactly the keys of the task", set(result) == set(TASK.actions))
     run.holds(f"indices are int64, got {result['buttons'].dtype}", result["buttons"].dtype == np.int64)
     ties = np.array([0.5, 0.5, 0.1, 0.3, 0.3, 0, 0.3, 5, 0])
@@ -142,14 +142,16 @@ def environment_actions_by_hand(run: Run) -> None:
         (1.7, 0, 10, 10),
         (1.7, -np.inf, np.inf, 1),
         (1e-20, -np.inf, np.inf, 1e-20),
-        (0.5, -np.inf, 0.25, 0.25),
-        (0.5, -0.25, np.inf, 0.5),
+        (0.5, -np.inf, 0.25, -0.25),
+        (0.5, -0.25, np.inf, 1.25),
+        (-1.7, -np.inf, 0.25, -1.75),
+        (1.7, -0.25, np.inf, 1.75),
     ):
         bounds = {"a": np.array([bottom])}, {"a": np.array([top])}
         run.expect("environment_action", (np.array([number]), one, *bounds), {"a": np.array([expected])}, bound=4 * run.u)
     batch = run.call("environment_action", np.stack([[flat, ties, flat], [ties, flat, flat]]), TASK, low, high)
     run.exact("buttons of a batch", batch["buttons"], [[[1, 2], [0, 1], [1, 2]], [[0, 1], [1, 2], [1, 2]]])
-    run.exact("turn of a batch", batch["turn"][1, 2], [7.5, -1, 0, 2])
+    run.exact("turn of a batch", batch["turn"][1, 2], [7.5, -1, 0.75, 2])
 
 
 @check("LOOP-12", uses=["environment_action"], level=0)

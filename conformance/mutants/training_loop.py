@@ -56,7 +56,8 @@ MUTANTS = (
         edits={
             "training_loop._rescale": {
                 "np.clip(part, -1.0, 1.0)": "part",
-                "np.clip(np.where(finite, rescaled, clipped), low, high)": "np.where(finite, rescaled, clipped)",
+                "np.clip(lowest + (clipped": "(lowest + (clipped",
+                "(highest - lowest), lowest, highest)": "(highest - lowest))",
             }
         },
     ),
@@ -66,7 +67,19 @@ MUTANTS = (
         provenance="plausible",
         violates=("LOOP-12",),
         fix="Scale [-1, 1] to the bounds.",
-        edits={"training_loop._rescale": {"np.where(finite, rescaled, clipped)": "np.where(finite, clipped, clipped)"}},
+        edits={"training_loop._rescale": {"np.where(below | above, rescaled, clipped)": "clipped"}},
+    ),
+    Mutant(
+        name="environment_clips_at_a_single_bound",
+        explanation="where a number has one bound only, half of the actions are that bound",
+        provenance="plausible: the environment gets [-1, 1] there, and clips it",
+        violates=("LOOP-12",),
+        fix="Scale [-1, 1] to the range 2 wide at the bound.",
+        edits={
+            "training_loop._rescale": {
+                "np.where(below | above, rescaled, clipped)": "np.clip(np.where(below & above, rescaled, clipped), low, high)"
+            }
+        },
     ),
     Mutant(
         name="training_starts_with_a_few_sequences",

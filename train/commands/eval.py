@@ -1,7 +1,6 @@
 """`train eval CHECKPOINT`: plays episodes with the agent of a checkpoint, on either backend."""
 
 import argparse
-import functools
 import json
 import math
 import statistics
@@ -14,9 +13,9 @@ import numpy as np
 from reference_numpy.training_loop import derive_seed
 from train import arguments as keywords
 from train.backend import Learner
-from train.checkpoint import open_checkpoint
+from train.checkpoint import differences, open_checkpoint, space_entries
 from train.cli import BACKENDS, Parser
-from train.envs import ContractEnv, Environments, Record, make_env, try_out
+from train.envs import ContractEnv, Environments, Record, env_maker, try_out
 from train.errors import UserError, writing
 from train.evaluation import Agent, Episode, play_episodes, report_failure, report_failures
 from train.files import replacing
@@ -55,18 +54,11 @@ def main(arguments: Sequence[str]) -> int:
         device=values.device,
         action_repeat=saved.info["action_repeat"],
         image_size=saved.info["image_size"],
+        observations=tuple(saved.spaces.observations),
     )
     learner_type = import_learner(options.backend)
     film = Film(values.video) if values.video else None
-    make: Callable[[int], ContractEnv] = functools.partial(
-        make_env,
-        options.task,
-        image_size=options.image_size,
-        action_repeat=options.action_repeat,
-        render=film is not None,
-        arguments=options.env_arg,
-        time_limit=options.time_limit,
-    )
+    make: Callable[[int], ContractEnv] = env_maker(options, render=film is not None)
     make = film.filming(make) if film else make
     count = min(saved.config.envs, values.episodes)
     with ExitStack() as stack:
@@ -77,6 +69,8 @@ def main(arguments: Sequence[str]) -> int:
         stack.enter_context(closing(envs))
         if envs.spaces != saved.spaces:
             raise UserError(f"the task {options.task} has the spaces {envs.spaces}; the agent of {checkpoint.path} has {saved.spaces}")
+        if found := differences(space_entries(saved.translation.to_json()), space_entries(envs.translation.to_json())):
+            raise UserError(f"the task {options.task} is not the one that the agent of {checkpoint.path} knows: {'; '.join(found[:3])}")
         learner = make_learner(learner_type, options, saved.spaces)
         try:
             learner.load_state_dict(checkpoint.learner)

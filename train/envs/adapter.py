@@ -29,7 +29,8 @@ class ContractEnv(gymnasium.Env[Observation, np.ndarray]):
 
     env: the environment. task, index: its name and number, for messages. image_size: side of every image, in pixels. action_repeat: how
     often each action is applied; the rewards are summed, and the repetition stops where the episode ends. info_metrics: names in the
-    info of an episode's last step that `step` returns under "metrics", see `info.chosen`.
+    info of an episode's last step that `step` returns under "metrics", see `info.chosen`. observations, leave_out: which
+    keys, or patterns of keys, to use and not to use; all where `observations` is empty.
 
     Raises:
       UserError: an unsupported space.
@@ -44,6 +45,8 @@ class ContractEnv(gymnasium.Env[Observation, np.ndarray]):
         image_size: int = 64,
         action_repeat: int = 1,
         info_metrics: Sequence[str] = (),
+        observations: Sequence[str] = (),
+        leave_out: Sequence[str] = (),
     ) -> None:
         self.task = task
         self._env = env
@@ -54,10 +57,10 @@ class ContractEnv(gymnasium.Env[Observation, np.ndarray]):
         self._seed: int | None = None
         self._episode = 0
         try:
-            self._translation = translate(env.observation_space, env.action_space, image_size)
+            self.translation = translate(env.observation_space, env.action_space, image_size, observations, leave_out)
         except UserError as error:
             raise UserError(f"task {task}: {error}") from error
-        self.spaces: Spaces = self._translation.spaces
+        self.spaces: Spaces = self.translation.spaces
         self.frame_skip = frame_skip(env)
         self.metadata = {}
         self.render_mode = env.render_mode
@@ -82,7 +85,7 @@ class ContractEnv(gymnasium.Env[Observation, np.ndarray]):
         self._steps += 1
         total = 0.0
         for _ in range(self._action_repeat):
-            value = self._env.step(self._translation.action(action))  # Made anew: an environment may write into it.
+            value = self._env.step(self.translation.action(action))  # A new one: an environment may write into it.
             if not isinstance(value, tuple) or len(value) != 5:
                 raise self._garbage(
                     f"step returned {_describe(value)}; Gymnasium's step returns (observation, reward, terminated, truncated, info)"
@@ -111,8 +114,8 @@ class ContractEnv(gymnasium.Env[Observation, np.ndarray]):
 
     def _observation(self, value: Any) -> Observation:
         try:
-            return self._translation.observation(value)
-        except UserError as error:
+            return self.translation.observation(value)
+        except ValueError as error:
             raise self._garbage(str(error)) from error
 
     def _metrics(self, info: Any) -> EpisodeInfo:

@@ -7,11 +7,12 @@ MODULE:CALLABLE     your own: a function or class that returns a gymnasium.Env: 
 """
 
 import contextlib
+import functools
 import importlib
 import inspect
 import sys
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +20,31 @@ import gymnasium
 
 from train import arguments as keywords
 from train.envs.adapter import ContractEnv
+from train.envs.info import names_of
 from train.errors import UserError
+from train.options import Options
 
 SUITES = "gym:ID, dmc:DOMAIN-TASK, dmc_vision:DOMAIN-TASK or MODULE:CALLABLE"
 
 # Namespace of a Gymnasium id -> the package that registers it, and our extra that installs it. Folder inside Gymnasium -> our extra.
 _NAMESPACES = {"ALE": ("ale_py", "atari")}
 _EXTRAS = {"box2d": "box2d", "mujoco": "mujoco", "classic_control": "train"}
+
+
+def env_maker(options: Options, render: bool = False) -> Callable[[int], ContractEnv]:
+    """index -> the environment that these options describe."""
+    return functools.partial(
+        make_env,
+        options.task,
+        image_size=options.image_size,
+        action_repeat=options.action_repeat,
+        info_metrics=names_of(options.info_metrics),
+        render=render,
+        arguments=options.env_arg,
+        time_limit=options.time_limit,
+        observations=options.observations,
+        leave_out=options.leave_out,
+    )
 
 
 def make_env(
@@ -37,6 +56,8 @@ def make_env(
     render: bool = False,
     arguments: Mapping[str, Any] | None = None,
     time_limit: int | None = None,
+    observations: Sequence[str] = (),
+    leave_out: Sequence[str] = (),
 ) -> ContractEnv:
     """The environment of a task string, adapted. `index` numbers the instances of a run, for messages. render: with the render mode
     "rgb_array", where the environment has one. arguments: keyword arguments with which the environment is made. time_limit: frames after
@@ -58,7 +79,7 @@ def make_env(
         env = _limited(_make_dm_control(task, name, suite == "dmc_vision", image_size, render, time_limit), time_limit)
     else:
         env = _limited(_make_own(task, suite, name, render, arguments), time_limit)
-    return ContractEnv(env, task, index, image_size, action_repeat, info_metrics)
+    return ContractEnv(env, task, index, image_size, action_repeat, info_metrics, observations, leave_out)
 
 
 def _limited(env: gymnasium.Env[Any, Any], time_limit: int | None) -> gymnasium.Env[Any, Any]:

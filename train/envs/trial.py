@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 from gymnasium.vector.utils import CloudpickleWrapper
 
-from spec import Spaces
 from train.envs.adapter import ContractEnv
 from train.envs.failure import Failure, attempt
 from train.envs.process import DYING, begin_worker, ended, no_answer, not_started, start_method
 from train.envs.spaces import random_actions
 from train.signals import unbroken
+from train.translation import Translation
 
 SLOW_STEP = 5e-4  # seconds; from here on a process of its own is faster than taking turns
 CLOSING = 5.0  # seconds that an environment has to close by itself
@@ -28,13 +28,13 @@ Tell = Callable[[Failure], None]
 
 @dataclasses.dataclass(frozen=True)
 class Trial:
-    """task, spaces, frame_skip: of all environments.
+    """task, translation, frame_skip: of all environments.
 
     deserves_process: because its steps are slow, or because it failed when it was tried out.
     """
 
     task: str
-    spaces: Spaces
+    translation: Translation
     frame_skip: int
     deserves_process: bool = True
 
@@ -53,8 +53,8 @@ def try_out(make: Make, tell: Tell, task: str = "", seed: int | None = None, tim
         with _process(make, task, seed, timeout) as receive:
             made = receive("when it was made")
             if not isinstance(made, Failure):
-                known_task, spaces, frame_skip = made
-                return Trial(known_task, spaces, frame_skip, seed is None or _deserves_process(receive, tell))
+                known_task, translation, frame_skip = made
+                return Trial(known_task, translation, frame_skip, seed is None or _deserves_process(receive, tell))
         attempts += 1
         _require_another(made, attempts, tell)
 
@@ -135,7 +135,7 @@ def _look(make: Callable[[], ContractEnv], task: str, seed: int | None, pipe: co
     if isinstance(env, Failure):
         pipe.send(env)
         return
-    pipe.send((env.task, env.spaces, env.frame_skip))
+    pipe.send((env.task, env.translation, env.frame_skip))
     if seed is not None:
         began = attempt(lambda: _begin(env, seed), 0, lambda: _place(task, "at its first reset"))
         pipe.send(began)

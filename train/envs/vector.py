@@ -18,6 +18,7 @@ from train.envs.stream import Step
 from train.envs.trial import Trial, make_here, try_out
 from train.envs.worker import InProcess, OwnProcess, Worker, receive
 from train.errors import UserError
+from train.translation import Translation
 
 Record = dict[str, np.ndarray]
 
@@ -65,7 +66,8 @@ class Environments:
         self._records = 0
         first = None if processes else make_here(make, self._count, task)
         known = first or trial or try_out(make, self._count, task, timeout=timeout)
-        self.spaces: Spaces = known.spaces
+        self.translation: Translation = known.translation
+        self.spaces: Spaces = known.translation.spaces
         self.frame_skip: int = known.frame_skip
         self._episodes: dict[int, Episode] = {}
         self._action = np.zeros((count, self.spaces.action_size), np.float32)
