@@ -20,7 +20,7 @@ from train_runs import Make, run_quietly
 
 from conformance.problems import small_config
 from spec import Spaces, Vector
-from train import checkpoint, files, loop, setup
+from train import checkpoint, files, forecast, loop
 from train.cli import main
 from train.errors import UserError
 from train.files import Unreadable
@@ -410,9 +410,8 @@ def test_spaces_that_no_machine_holds_are_refused(make: Make, task: str) -> None
 
 
 def test_a_model_that_the_machine_cannot_hold_is_refused(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(setup, "FITS", 0.0)
-    monkeypatch.setattr(setup, "describe", lambda: {"memory_gib": 1e-5})
-    with pytest.raises(UserError, match=r"parameters take .* GiB for training, and this machine has 1e-05: choose a smaller --size"):
+    monkeypatch.setattr(forecast, "machine_memory", lambda: 10_000)
+    with pytest.raises(UserError, match=r"parameters and their optimizer take .*, and this machine gives 9\.77 KiB: .* smaller --size"):
         loop.run(make(), FakeLearner)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from spec import Discrete, Image, Spaces
 from train import cgroups
+from train.errors import UserError
 from train.logger import duration
 from train.machine import physical_memory
 from train.options import Options
@@ -22,7 +23,11 @@ DAY = 86_400.0
 
 
 def say_memory(options: Options, spaces: Spaces, parameters: int, say: Callable[[str], None]) -> None:
-    """Before anything is allocated: the sizes, and a warning where the machine has less."""
+    """Before anything is allocated: the sizes, and a warning where the machine has less.
+
+    Raises:
+      UserError: the parameters and their optimizer alone take more memory than there is.
+    """
     state, record = 4 * COPIES * parameters, record_bytes(spaces, options)
     records = min(options.config.replay_capacity, math.ceil(options.steps / options.action_repeat))
     disk, mapped = records * record, min(records * record, int(options.replay_memory * 2**30))
@@ -31,9 +36,15 @@ def say_memory(options: Options, spaces: Spaces, parameters: int, say: Callable[
         f"replay buffer, {size(mapped)} of which in memory at most, and memory for a batch's intermediate arrays"
     )
     memory = machine_memory()
+    if memory is not None and state > memory:
+        sizes = {key: space.encoded_size for key, space in (*spaces.vectors.items(), *spaces.actions.items())}
+        largest = f", or describe {max(sizes, key=lambda key: sizes[key])!r} by fewer numbers" if sizes else ""
+        raise UserError(
+            f"{parameters:,} parameters and their optimizer take {size(state)}, and this machine gives {size(memory)}: choose a smaller "
+            f"--size{largest}"
+        )
     if memory is not None and state + mapped > memory:
-        remedy = "a smaller --size" if state > mapped else "a smaller --replay-memory"
-        say(f"WARNING: that is more than the {size(memory)} of memory that this machine gives; choose {remedy}")
+        say(f"WARNING: that is more than the {size(memory)} of memory that this machine gives; choose a smaller --size or --replay-memory")
     there = sum(file.stat().st_size for file in (options.logdir / "replay").glob("chunk-*"))
     place = options.logdir.absolute()  # It need not be there yet.
     free = shutil.disk_usage(next(folder for folder in (place, *place.parents) if folder.exists())).free

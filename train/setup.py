@@ -11,7 +11,7 @@ import numpy as np
 from reference_numpy.training_loop import ReplayRatio, derive_seed
 from spec import Spaces, parameter_table
 from train import checkpoint, logdir, resume, saved_run, threads
-from train.about import write_about
+from train.about import About, write_about
 from train.backend import Learner, learner_class
 from train.checkpoint import Checkpoint
 from train.envs import Environments, Record, doubts, env_maker, try_out
@@ -20,7 +20,6 @@ from train.errors import UserError
 from train.evaluation import play_randomly, report_failure
 from train.forecast import say_memory
 from train.logger import Display, Logger
-from train.machine import describe
 from train.options import Options
 from train.outcome import mean_of
 from train.replay import Prefetcher, Replay, erase
@@ -31,35 +30,23 @@ from train.warm_start import begin_from, require_same_origin
 if TYPE_CHECKING:
     from conformance.preflight import Report
 
-FITS = 2.0  # GiB that every machine has
-
-
 def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -> Run:
     """Everything that can go wrong is tried here, the cheap things first. What must be closed is left to the stack."""
     _require_trainable(options)
     is_new = not options.logdir.exists()
     _require_place(options.logdir)
     if not is_new:
-        _hold_logdir(options, stack)
+        logdir.hold(options.logdir, stack)
     display = stack.enter_context(Display(options.steps))
     saved = _find_checkpoint(options, display)
     learner_type = learner or import_learner(options.backend)
     envs, test_envs = _make_environments(options, display, stack)
-    if warning := repeated_twice(options.task, envs.frame_skip, options.action_repeat):
-        display.say(warning)
-    if saved:
-        checkpoint.require_same_spaces(saved, envs.spaces.to_json())
-        checkpoint.require_same_translation(saved, envs.translation.to_json())
-        require_same_origin(options)
-    for line in envs.translation.lines:
-        display.say(line)
-    parameters = _count_parameters(options, envs.spaces)
-    say_memory(options, envs.spaces, parameters, display.say)
+    parameters = _understand(options, saved, envs, display)
     agent = make_learner(learner_type, options, envs.spaces)  # Before preflight: it says what is wrong with the device.
     origin = begin_from(options, agent, envs.spaces) if options.from_ and not saved else None
     report = _preflight(options, envs.spaces, display) if options.preflight and _progress(options, saved)[1] < options.steps else None
     if is_new:  # Only now: what was mistyped leaves no directory behind.
-        _hold_logdir(options, stack)
+        logdir.hold(options.logdir, stack)
         if resume.find(options, display):
             raise UserError(f"another process has begun a run in {options.logdir} meanwhile; the same command continues it")
     if saved:
@@ -68,7 +55,6 @@ def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -
         logdir.claim(options.logdir)  # Before anything else is written there.
     replay, record, own_buffer = _open_replay(options, saved, envs, display)
     starts, step = _progress(options, saved)
-    changed = resume.changes(saved, options) if saved else {}
     about = write_about(
         options,
         spaces=envs.spaces,
@@ -76,13 +62,11 @@ def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -
         parameters=parameters,
         preflight=report,
         resumed_at=step if saved else None,
-        given_anew=changed,
+        given_anew=resume.changes(saved, options) if saved else {},
         origin=origin,
         understood=envs.translation.lines,
     )
     logger = Logger(options.logdir, saved.info["log"] if saved else None, wandb=options.wandb, about=about)
-    for line in logger.warnings:
-        display.say(f"WARNING: {line}")
     run = Run(
         options=options,
         envs=envs,
@@ -97,18 +81,7 @@ def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -
         record=_begin(options, envs, starts) if record is None else record,
         carry=agent.initial_carry(envs.count),
     )
-    for line in doubts(envs.spaces, run.record):
-        display.say(line)
-    display.say(
-        f"{options.task}: {options.backend} on {run.learner.device}, {_counted(_threads(options, envs.spaces), 'thread')}, "
-        f"{parameters:,} parameters, {_counted(envs.count, 'environment')}, seed {options.seed}; logs in {options.logdir}"
-    )
-    if changed:
-        display.say(f"changed from here on: {'; '.join(f'{name} {before} -> {now}' for name, (before, now) in changed.items())}")
-    if origin:
-        display.say(
-            f"beginning with the parameters of {origin['checkpoint']} ({origin['task']}, step {origin['step']:,}), a fresh optimizer"
-        )
+    _say_start(run, about)
     if saved:
         resume.restore(run, saved, exactly=record is not None, own_buffer=own_buffer)
     else:
@@ -116,6 +89,37 @@ def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -
     run.counters.starts += record is None
     say_outlook(run)
     return run
+
+
+def _understand(options: Options, saved: Checkpoint | None, envs: Environments, display: Display) -> int:
+    """Says what the environments are, if a checkpoint does not want others. Returns the number of parameters."""
+    if saved:
+        checkpoint.require_same_spaces(saved, envs.spaces.to_json())
+        checkpoint.require_same_translation(saved, envs.translation.to_json())
+        require_same_origin(options)
+    for line in envs.translation.lines:
+        display.say(line)
+    if warning := repeated_twice(options.task, envs.frame_skip, options.action_repeat):
+        display.say(warning)
+    parameters = _count_parameters(options, envs.spaces)
+    say_memory(options, envs.spaces, parameters, display.say)
+    return parameters
+
+
+def _say_start(run: Run, about: About) -> None:
+    options, say = run.options, run.display.say
+    for line in run.logger.warnings:
+        say(f"WARNING: {line}")
+    for line in doubts(run.envs.spaces, run.record):
+        say(line)
+    say(
+        f"{options.task}: {options.backend} on {run.learner.device}, {_counted(_threads(options, run.envs.spaces), 'thread')}, "
+        f"{about['parameters']:,} parameters, {_counted(run.envs.count, 'environment')}, seed {options.seed}; logs in {options.logdir}"
+    )
+    if changed := about["starts"][-1].get("changed"):
+        say(f"changed from here on: {'; '.join(f'{name} {before} -> {now}' for name, (before, now) in changed.items())}")
+    if (origin := about.get("origin")) and len(about["starts"]) == 1:
+        say(f"beginning with the parameters of {origin['checkpoint']} ({origin['task']}, step {origin['step']:,}), a fresh optimizer")
 
 
 def _counted(number: int, noun: str) -> str:
@@ -143,15 +147,6 @@ def _require_place(logdir: Path) -> None:
         raise UserError(
             f"cannot write to the log directory {logdir}: {place} is no directory that can be written to; choose another with --logdir"
         )
-
-
-def _hold_logdir(options: Options, stack: ExitStack) -> None:
-    """Locks the log directory until the run ends, however it ends: two processes would cut each other's files.
-
-    Raises:
-      UserError: another process holds it, or it cannot be written.
-    """
-    logdir.hold(options.logdir, stack)
 
 
 def _require_trainable(options: Options) -> None:
@@ -210,19 +205,10 @@ def _make_environments(options: Options, display: Display, stack: ExitStack) -> 
 
 def _count_parameters(options: Options, spaces: Spaces) -> int:
     try:
-        count = sum(math.prod(parameter.shape) for parameter in parameter_table(options.config, spaces).values())
+        return sum(math.prod(parameter.shape) for parameter in parameter_table(options.config, spaces).values())
     except ValueError as error:
         remedy = " (--image-size)" if spaces.images else ""
         raise UserError(f"task {options.task}: {error}{remedy}") from error
-    needed = 16 * count / 2**30  # parameters, two moments and gradients
-    memory = describe()["memory_gib"] if needed > FITS else None
-    if isinstance(memory, float) and needed > memory:
-        sizes = {key: space.encoded_size for key, space in (*spaces.vectors.items(), *spaces.actions.items())}
-        largest = f", or describe {max(sizes, key=lambda key: sizes[key])!r} by fewer numbers" if sizes else ""
-        raise UserError(
-            f"{count:,} parameters take {needed:,.3g} GiB for training, and this machine has {memory:g}: choose a smaller --size{largest}"
-        )
-    return count
 
 
 def _preflight(options: Options, spaces: Spaces, display: Display) -> "Report":
