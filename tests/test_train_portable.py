@@ -22,7 +22,7 @@ from train.backend import learner_class
 from train.checkpoint import open_checkpoint
 from train.cli import main
 from train.commands.eval import sentence, summarize
-from train.envs import Environments
+from train.envs import Environments, make_env
 from train.evaluation import Episode
 from train.replay import Replay
 
@@ -41,7 +41,8 @@ ROBOT = Spaces({"position": Vector(3), "image": Image(16, 16, 3)}, {"arm": Vecto
 @pytest.fixture
 def counting(tmp_path: Path) -> str:
     """Episode n of `Counting` has five records and the return 40 n + 10, whatever the agent does."""
-    return str(save_checkpoint(tmp_path / "run", CONFIG, COUNTING, task="train_fakes:Counting", backend="torch"))
+    task = "train_fakes:Counting"
+    return str(save_checkpoint(tmp_path / "run", CONFIG, COUNTING, task=task, backend="torch", translation=make_env(task).translation))
 
 
 COUNT = ["--task", "train_fakes:Counting", "--episodes"]
@@ -76,7 +77,7 @@ def test_an_evaluation_says_returns_and_lengths(counting: str, tmp_path: Path, c
 
 
 def test_one_episode_has_no_standard_error() -> None:
-    summary = summarize([Episode(7.5, 3)])
+    summary = summarize([Episode(7.5, 3, {})])
     assert summary["return_standard_error"] is None
     assert sentence(summary) == "return 7.5 (min 7.5, max 7.5), length 3 (min 3, max 3)"
 
@@ -258,3 +259,11 @@ def test_a_run_that_changes_the_backend_goes_on(tmp_path: Path, capsys: pytest.C
         spread = before.max() - before.min()
         assert before.min() - spread < after[:12].mean() < before.max() + spread
     assert lines[0]["train/loss/total"] > 1.5 * losses[300].max(), "what a learner that began anew would show"
+
+
+@pytest.mark.parametrize(("name", "reason"), [("", "Is a directory"), ("no/result.json", "there is no folder")])
+def test_a_result_that_cannot_be_written_is_refused_before_an_episode(
+    counting: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, name: str, reason: str
+) -> None:
+    monkeypatch.setattr(train.commands.eval, "play", pytest.fail)
+    assert reason in refusal(capsys, counting, *COUNT, "1", "--json", str(tmp_path / name))

@@ -5,7 +5,7 @@ import re
 import sys
 import types
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
@@ -318,14 +318,36 @@ def test_what_was_understood_is_said_in_words() -> None:
     assert list(translate(Declared.observation_space, Declared.action_space, leave_out=["notes"]).lines) == LINES
 
 
+class Growing(train_fakes.Counting):
+    """The second instance has another range of actions."""
+
+    made: ClassVar[int] = 0
+
+    def __init__(self) -> None:
+        super().__init__()
+        type(self).made += 1
+        if self.made == 2:
+            self.action_space = gym.Box(-2, 2, (2,), F4)
+
+
+def test_environments_of_evaluation_are_like_those_of_training(make: Make) -> None:
+    Growing.made = 0
+    expected = r"an environment of evaluation is not like those of training: action 'action' is .* -2.*, elsewhere"
+    with pytest.raises(UserError, match=expected):
+        run_quietly(make(task="test_train_spaces:Growing", processes="no", eval_episodes=1))
+
+
 @pytest.mark.covers("LOOP-61")
-def test_a_run_says_what_it_understood_before_anything_else(make: Make, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_says_what_it_understood_before_it_trains(make: Make, capsys: pytest.CaptureFixture[str]) -> None:
     options = make()
     lines = list(make_env(options.task).translation.lines)
     assert len(lines) == 3
     assert lines[2].startswith("WARNING: action action: 1 of 2 numbers without bounds below 1,000,000")
     run_quietly(options)
-    assert capsys.readouterr().out.splitlines()[:3] == lines
+    said = capsys.readouterr().out.splitlines()
+    first = said.index(lines[0])
+    assert said[first : first + 3] == lines
+    assert first < next(i for i, line in enumerate(said) if "logs in" in line)
     assert json.loads((options.logdir / "run.json").read_text())["understood"] == lines
 
 

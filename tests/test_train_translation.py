@@ -17,7 +17,7 @@ from train_runs import Make, run_quietly
 
 from train import resume, setup
 from train.cli import main
-from train.envs import ContractEnv, translate
+from train.envs import ContractEnv, translate, trial
 from train.errors import UserError
 from train.policy import Policy
 from train.translation import Translation
@@ -106,6 +106,7 @@ def test_training_evaluation_and_an_exported_policy_act_alike(tmp_path: Path, mo
         return result
 
     monkeypatch.setattr(ContractEnv, "step", watched)
+    monkeypatch.setattr(trial, "SLOW_STEP", 1e9)  # What is evaluated is evaluated in this process.
     run, folder = str(tmp_path / "run"), tmp_path / "policy"
     words = "--size tiny --deter 16 --units 8 --stoch 3 --classes 5 --bins 31 --envs 2 --batch-size 2 --batch-length 4 --replay-ratio 1"
     words += " --steps 40 --image-size 16 --leave-out notes --env-arg length=6 --no-preflight --processes no --eval-episodes 0"

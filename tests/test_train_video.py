@@ -17,6 +17,7 @@ import train.setup
 from spec import Config, Image, Spaces, Vector, load_config
 from train import video
 from train.cli import main
+from train.envs import make_env
 from train.video import Film
 
 
@@ -62,7 +63,9 @@ def play(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capture
     def run(name: str, path: str, spaces: Spaces | None = None, config: Config = CONFIG) -> tuple[int, str]:
         task = f"test_train_video:{name}"
         spaces = spaces or Spaces({"observation": Vector(2)}, ACTION)
-        checkpoint = save_checkpoint(tmp_path / "run", config, spaces, task=task, image_size=16)
+        known = make_env(task, image_size=16).translation
+        known = known if known.spaces == spaces else None
+        checkpoint = save_checkpoint(tmp_path / "run", config, spaces, translation=known, task=task, image_size=16)
         arguments = ["eval", str(checkpoint), "--task", task, "--episodes", "3", "--video", str(tmp_path / path)]
         code = main(arguments)
         captured = capsys.readouterr()

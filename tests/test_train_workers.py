@@ -194,7 +194,7 @@ def test_an_environment_that_gives_no_first_record_stops_the_run(how: str, attem
     """In three attempts, or at once where others would end alike. The first one has been made already: another is the trouble."""
     envs = Environments(functools.partial(spoil, how), 2, processes)
     try:
-        with pytest.raises(UserError, match="environment 1 has the spaces" if how == "spaces" else "no such level") as error:
+        with pytest.raises(UserError, match="environment 1 is not like the first" if how == "spaces" else "no such level") as error:
             envs.reset([0, 1])
         assert ("(3 attempts)" in str(error.value)) == (attempts == 3)
         assert ("test_train_workers.py" in error.value.details) == (how != "spaces")

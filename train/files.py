@@ -15,6 +15,7 @@ Writing goes to a fresh name in the same folder, which is then renamed: what els
 
 import collections
 import dataclasses
+import errno
 import hashlib
 import json
 import os
@@ -247,6 +248,18 @@ def _require_plain(name: str, entry: Any) -> None:
 # Writing
 
 
+def require_place(path: Path) -> None:
+    """Whether a file may stand there, asked before hours of work are done for it.
+
+    Raises:
+      OSError: the path is a folder, or lies in none.
+    """
+    if not path.name or path.is_dir():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if not path.parent.is_dir():
+        raise FileNotFoundError(errno.ENOENT, f"there is no folder {path.parent}", str(path))
+
+
 @contextmanager
 def replacing(path: Path) -> Iterator[BinaryIO]:
     """A new file beside `path`, which takes its place when all of it is on the disk. A link at `path` is replaced, not followed.
@@ -254,6 +267,7 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
     Raises:
       OSError: the disk refuses it; then what stood there is as it was.
     """
+    require_place(path)
     name = path.with_name(f".{path.name}-{secrets.token_hex(4)}.tmp")
     descriptor = os.open(name, os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), 0o666)
     try:

@@ -26,9 +26,11 @@ from train.replay import Prefetcher, Replay, erase
 from train.schedule import say_outlook
 from train.state import Counters, Run, Scores
 from train.warm_start import begin_from, require_same_origin
+from train.words import counted
 
 if TYPE_CHECKING:
     from conformance.preflight import Report
+
 
 def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -> Run:
     """Everything that can go wrong is tried here, the cheap things first. What must be closed is left to the stack."""
@@ -113,17 +115,13 @@ def _say_start(run: Run, about: About) -> None:
     for line in doubts(run.envs.spaces, run.record):
         say(line)
     say(
-        f"{options.task}: {options.backend} on {run.learner.device}, {_counted(_threads(options, run.envs.spaces), 'thread')}, "
-        f"{about['parameters']:,} parameters, {_counted(run.envs.count, 'environment')}, seed {options.seed}; logs in {options.logdir}"
+        f"{options.task}: {options.backend} on {run.learner.device}, {counted(_threads(options, run.envs.spaces), 'thread')}, "
+        f"{about['parameters']:,} parameters, {counted(run.envs.count, 'environment')}, seed {options.seed}; logs in {options.logdir}"
     )
     if changed := about["starts"][-1].get("changed"):
         say(f"changed from here on: {'; '.join(f'{name} {before} -> {now}' for name, (before, now) in changed.items())}")
     if (origin := about.get("origin")) and len(about["starts"]) == 1:
         say(f"beginning with the parameters of {origin['checkpoint']} ({origin['task']}, step {origin['step']:,}), a fresh optimizer")
-
-
-def _counted(number: int, noun: str) -> str:
-    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def _progress(options: Options, saved: Checkpoint | None) -> tuple[int, int]:
@@ -200,7 +198,12 @@ def _make_environments(options: Options, display: Display, stack: ExitStack) -> 
     if options.eval_env == "shared":
         return envs, envs
     tests = min(envs.count, max(options.eval_episodes, options.random_episodes))
-    return envs, several(tests) if tests else None
+    if not tests:
+        return envs, None
+    test_envs = several(tests)
+    if found := envs.translation.differences(test_envs.translation):
+        raise UserError(f"task {options.task}: an environment of evaluation is not like those of training: {'; '.join(found[:3])}")
+    return envs, test_envs
 
 
 def _count_parameters(options: Options, spaces: Spaces) -> int:
@@ -279,4 +282,4 @@ def _measure_random_policy(run: Run) -> None:
         run.random_return = mean.value
         error = {} if mean.error is None else {"random/return_standard_error": mean.error}
         run.logger.write(0, 0.0, {"random/return": mean.value, **error})
-        run.display.say(f"a random policy gets {mean} (mean of {len(returns)} episodes)")
+        run.display.say(f"a random policy gets {mean} (mean of {counted(len(returns), 'episode')})")

@@ -76,6 +76,16 @@ class Translation:
         parts = environment_action(np.asarray(flat, np.float32), self.spaces, low, high)
         return _nested([(entry.path, _decode(parts[key], entry, key in reals)) for key, entry in self.actions.items()])
 
+    def differences(self, other: "Translation") -> list[str]:
+        """A text for each key that is not the same in another environment."""
+        mine, theirs = self._parts(), other._parts()
+        changed = [name for name in {**mine, **theirs} if mine.get(name) != theirs.get(name)]
+        return [f"{name} is {_show(*theirs.get(name, ()))}, elsewhere {_show(*mine.get(name, ()))}" for name in changed]
+
+    def _parts(self) -> dict[str, tuple[Target, Entry]]:
+        observations = {f"observation {key!r}": (self.spaces.observations[key], entry) for key, entry in self.observations.items()}
+        return observations | {f"action {key!r}": (self.spaces.actions[key], entry) for key, entry in self.actions.items()}
+
     def to_json(self) -> dict[str, Any]:
         """All but the spaces and the lines, in plain JSON types."""
         described = {
@@ -108,6 +118,14 @@ def side_axes(shape: tuple[int, ...]) -> tuple[int, int] | None:
     """The two axes of an image's rows and columns: neighbours, and the only ones of at least LEAST_SIDE entries. [LOOP-55]"""
     long = [axis for axis, size in enumerate(shape) if size >= LEAST_SIDE]
     return (long[0], long[1]) if len(long) == 2 and long[1] == long[0] + 1 and 2 <= len(shape) <= 4 else None
+
+
+def _show(target: Target | None = None, entry: Entry | None = None) -> str:
+    """Vector(size=2) of float32 [2] in -1.0, 1.0"""
+    if entry is None:
+        return "missing"
+    bounds = ", ".join(str(list(bound)).strip("[]")[:60] for bound in (entry.low, entry.high) if bound)
+    return f"{target} of {entry.dtype} {list(entry.shape)}" + (f" in {bounds}" if bounds else "")
 
 
 # Observations

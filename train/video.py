@@ -82,7 +82,7 @@ class _Filmed(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def __init__(self, env: ContractEnv, film: Film) -> None:
         super().__init__(env)
-        self.task, self.spaces, self.frame_skip = env.task, env.spaces, env.frame_skip
+        self.task, self.spaces, self.translation, self.frame_skip = env.task, env.spaces, env.translation, env.frame_skip
         self._film, self._picture = film, _source(env)
         film.fps = max(1.0, env.frames_per_second(USUAL_FPS))
 

@@ -18,12 +18,13 @@ from train.cli import BACKENDS, Parser
 from train.envs import ContractEnv, Environments, Record, env_maker, try_out
 from train.errors import UserError, writing
 from train.evaluation import Agent, Episode, play_episodes, report_failure, report_failures
-from train.files import replacing
+from train.files import replacing, require_place
 from train.logger import Display
 from train.options import Options, names_code
 from train.saved_agent import SavedAgent, agent_of
 from train.setup import import_learner, make_learner
 from train.video import Film
+from train.words import counted
 
 DESCRIPTION = """Play episodes with the agent of a checkpoint. It samples its actions, as in training, unless --mode is given.
 
@@ -38,6 +39,9 @@ def main(arguments: Sequence[str]) -> int:
       UserError: a wrong option, a checkpoint that cannot be read, an environment that does not fit it, a file that cannot be written.
     """
     values = _parse(arguments)
+    if values.json:
+        with writing(values.json):
+            require_place(values.json)
     checkpoint = open_checkpoint(values.checkpoint)
     saved = agent_of(checkpoint)  # Before a learner is made: it has looked at the sizes.
     task = values.task or _task_without_code(saved)
@@ -79,7 +83,8 @@ def main(arguments: Sequence[str]) -> int:
         episodes = play(learner, envs, values.episodes, options.seed, display, values.mode)
     summary = summarize(episodes)
     where = f"{options.backend} on {learner.device}{', by the mode' if values.mode else ''}"
-    print(f"{checkpoint.path}: {options.task}, step {saved.info['step']:,}; {len(episodes)} episodes with {where}, seed {values.seed}")
+    played = counted(len(episodes), "episode")
+    print(f"{checkpoint.path}: {options.task}, step {saved.info['step']:,}; {played} with {where}, seed {values.seed}")
     print(sentence(summary))
     if film:
         print(film.save())

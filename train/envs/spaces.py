@@ -15,6 +15,7 @@ from gymnasium import spaces as gym
 from spec import Discrete, Image, Spaces, Vector
 from train.errors import UserError
 from train.translation import DTYPES, LEAST_SIDE, Entry, Path, Target, Translation, side_axes
+from train.words import counted
 
 NO_BOUND = 1e6  # from here on a bound is none, see E-20
 MOST_CODES = 32  # values of an entry of a board that become one-hots, see E-19
@@ -160,10 +161,10 @@ def _observation(key: str, path: Path, space: gym.Space[Any], image_size: int) -
     if (ends := _image_bounds(space)) is not None:
         return _image(path, space, ends, image_size)
     if (counts := _codes(space)) is not None:
-        words = f"{_count(len(counts), 'choice')} of {_span(counts)} classes, as one-hots"
+        words = f"{counted(len(counts), 'choice')} of {_span(counts)} classes, as one-hots"
         return Meaning(Discrete(tuple(counts)), _entry(path, space, low=space.low), _declared(space), words)
     target = Vector(int(np.prod(space.shape)))
-    return Meaning(target, _entry(path, space), _declared(space), _count(target.size, "real number"), tuple(_vector_warnings(space)))
+    return Meaning(target, _entry(path, space), _declared(space), counted(target.size, "real number"), tuple(_vector_warnings(space)))
 
 
 def _image_bounds(space: gym.Box) -> tuple[float, float] | None:
@@ -180,7 +181,7 @@ def _image(path: Path, space: gym.Box, ends: tuple[float, float], image_size: in
     assert axes is not None
     height, width = (space.shape[axis] for axis in axes)
     target = Image(image_size, image_size, int(np.prod(space.shape)) // (height * width))
-    words = f"image {target.height} x {target.width}, {_count(target.channels, 'channel')}"
+    words = f"image {target.height} x {target.width}, {counted(target.channels, 'channel')}"
     if (height, width) != (image_size, image_size):
         words += f", resized from {height} x {width}"
     warnings = []
@@ -228,10 +229,10 @@ def _action(key: str, path: Path, space: gym.Space[Any]) -> Meaning:
         if max(counts) > MOST_CHOICES:
             remedy = f"whole numbers are choices, at most {MOST_CHOICES} each; declare a Box of floats, and round in the environment"
             raise _unsupported("action", key, space, remedy)
-        words = f"{_count(len(counts), 'choice')} of {_span(counts)} classes"
+        words = f"{counted(len(counts), 'choice')} of {_span(counts)} classes"
         return Meaning(Discrete(tuple(counts)), _entry(path, space, low=space.low), _declared(space), words)
     low, high, warnings = _ranges(space)
-    words = f"{_count(low.size, 'real number')} in {_intervals(low, high)}"
+    words = f"{counted(low.size, 'real number')} in {_intervals(low, high)}"
     return Meaning(Vector(low.size), _entry(path, space, low=low, high=high), _declared(space), words, warnings)
 
 
@@ -246,7 +247,7 @@ def _ranges(space: gym.Box) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
         "without bounds": ("[-1, 1]", int((below & above).sum())),
         "with one bound": ("the 2 units next to it", int((below != above).sum())),
     }
-    numbers = f"of {_count(low.size, 'number')}"
+    numbers = f"of {counted(low.size, 'number')}"
     warnings = (
         f"{count} {numbers} {bounds} below {NO_BOUND:,.0f}: moved in {where}; {remedy}"
         for bounds, (where, count) in doubts.items()
@@ -273,7 +274,7 @@ def _choices(kind: str, key: str, path: Path, space: gym.Space[Any]) -> Meaning 
         raise _unsupported(kind, key, space, remedy)
     start = np.ravel(getattr(space, "start", 0))  # Gymnasium's number that a space counts from
     entry = _entry(path, space, low=start, scalar=isinstance(space, gym.Discrete))
-    words = f"{_count(len(counts), 'choice')} of {_span(counts)} classes"
+    words = f"{counted(len(counts), 'choice')} of {_span(counts)} classes"
     return Meaning(Discrete(tuple(counts)), entry, _declared(space), words)
 
 
@@ -318,10 +319,6 @@ def _declared(space: gym.Space[Any]) -> str:
         return f"{words} in {_intervals(space.low.ravel(), space.high.ravel())}"
     start = np.ravel(getattr(space, "start", 0))
     return f"{words} from {_span(start)}" if start.any() else words
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 
 def _span(numbers: Any) -> str:

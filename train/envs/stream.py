@@ -7,12 +7,12 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from spec import Spaces
 from train.envs.adapter import ContractEnv, Observation, array_spaces, where
 from train.envs.failure import Failure, attempt
 from train.envs.history import History
 from train.envs.process import begin_worker
 from train.errors import UserError
+from train.translation import Translation
 
 Step = tuple[Observation, float, bool, bool, dict[str, Any]]
 
@@ -21,7 +21,7 @@ class Stream(gymnasium.Env[Observation, np.ndarray]):
     """The step after the end of an episode ignores its action and resets: [LOOP-11]. Nothing raises: see `_guarded`.
 
     make: index -> environment; called by the first reset, for which Gymnasium waits with a limit, as it does not for the making.
-    spaces: those of every environment of the run. trainer: id of the process that closes the workers. env: if it has been made already.
+    translation: of every environment of the run. trainer: id of the process that closes the workers. env: if it has been made already.
     """
 
     def __init__(
@@ -29,14 +29,15 @@ class Stream(gymnasium.Env[Observation, np.ndarray]):
         make: Callable[[int], ContractEnv],
         index: int,
         task: str,
-        spaces: Spaces,
+        translation: Translation,
         trainer: int,
         env: ContractEnv | None = None,
     ) -> None:
         self._make = make
         self._index = index
         self._task = task
-        self._spaces = spaces
+        self._translation = translation
+        spaces = translation.spaces
         self._env = env
         self._ended = False
         self._steps = 0
@@ -91,8 +92,8 @@ class Stream(gymnasium.Env[Observation, np.ndarray]):
 
     def _made(self) -> ContractEnv:
         env = self._make(self._index)
-        if env.spaces != self._spaces:
-            raise UserError(f"task {self._task}: environment {self._index} has the spaces {env.spaces}, others {self._spaces}")
+        if found := self._translation.differences(env.translation):
+            raise UserError(f"task {self._task}: environment {self._index} is not like the first: {'; '.join(found[:3])}")
         return env
 
     def shut(self) -> None:

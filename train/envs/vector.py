@@ -75,9 +75,9 @@ class Environments:
         self._workers: list[Worker] = []
         for index in range(count):
             if processes:
-                self._workers.append(OwnProcess(make, index, known.task, self.spaces, timeout))
+                self._workers.append(OwnProcess(make, index, known.task, self.translation, timeout))
             else:
-                self._workers.append(InProcess(make, index, known.task, self.spaces, None if index else first))
+                self._workers.append(InProcess(make, index, known.task, self.translation, None if index else first))
 
     def reset(self, seeds: Sequence[int]) -> Record:
         """The first records of new episodes, [N, ...] each."""

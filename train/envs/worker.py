@@ -13,13 +13,13 @@ import numpy as np
 from gymnasium.error import AlreadyPendingCallError, NoAsyncCallError
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 
-from spec import Spaces
 from train.envs.adapter import ContractEnv, where
 from train.envs.failure import Failure
 from train.envs.history import History
 from train.envs.process import DYING, ended, no_answer, not_started, start_method
 from train.envs.stream import Step, Stream
 from train.signals import unbroken
+from train.translation import Translation
 
 # What Gymnasium raises where the process has ended: when something is received, when it is sent, and when that had failed.
 GONE = (EOFError, OSError, NoAsyncCallError)
@@ -31,8 +31,10 @@ class InProcess:
     env: the environment, if it has been made already.
     """
 
-    def __init__(self, make: Callable[[int], ContractEnv], index: int, task: str, spaces: Spaces, env: ContractEnv | None) -> None:
-        self._make_stream = functools.partial(Stream, make, index, task, spaces, os.getpid())
+    def __init__(
+        self, make: Callable[[int], ContractEnv], index: int, task: str, translation: Translation, env: ContractEnv | None
+    ) -> None:
+        self._make_stream = functools.partial(Stream, make, index, task, translation, os.getpid())
         self._stream = self._make_stream(env)
         self._work: Callable[[], Step] | None = None
 
@@ -65,8 +67,8 @@ class OwnProcess:
     timeout: seconds for an answer. patience: the same, or more while actions are replayed. pipe: through which the answer comes.
     """
 
-    def __init__(self, make: Callable[[int], ContractEnv], index: int, task: str, spaces: Spaces, timeout: float) -> None:
-        self._make_stream = functools.partial(Stream, make, index, task, spaces, os.getpid())
+    def __init__(self, make: Callable[[int], ContractEnv], index: int, task: str, translation: Translation, timeout: float) -> None:
+        self._make_stream = functools.partial(Stream, make, index, task, translation, os.getpid())
         self._index, self._task, self._timeout = index, task, timeout
         self._envs: AsyncVectorEnv | None = None
         self._wait: Callable[[float | None], Step] = self._wait_for_reset
