@@ -449,7 +449,10 @@ def test_the_command_writes_the_page(tmp_path: Path, capsys: pytest.CaptureFixtu
         (["report"], "required: LOGDIR"),
         (["report", "{}/missing"], "missing is not there; expected a log directory"),
         (["report", "{}"], "holds no run: neither metrics.jsonl nor run.json"),
-        (["report", "{}/run", "--out", "{}/no/page.html"], "choose another file with --out"),
+        (["report", "{}/run", "--out", "{}/no/page.html"], "there is no folder"),
+        (["report", "{}/run", "--out", "{}/run"], "Is a directory; choose another file with --out"),
+        (["report", "{}/missing", "--out", "."], "cannot write .: Is a directory"),
+        (["report", "{}/missing", "--out", ""], "cannot write .: Is a directory"),
     ],
 )
 def test_mistakes_have_one_clear_line(tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str) -> None:

@@ -6,7 +6,6 @@ from train import before_numpy  # noqa: F401
 import argparse
 import importlib
 import importlib.util
-import math
 import re
 import shlex
 import sys
@@ -37,6 +36,7 @@ from train.replay.layout import DETER_DTYPES
 from train.signals import stoppable
 
 BACKENDS = ("jax", "torch")
+LONGEST, LARGEST = 1e9, 1e9  # seconds, GiB: more than anybody means, and less than the system refuses
 USAGE = "train --backend {jax,torch} [options]\n       train COMMAND ... (train COMMAND --help says more)"
 DESCRIPTION = """Train a DreamerV3 agent.
 
@@ -294,7 +294,7 @@ def _add_beginning(add: Callable[..., Any]) -> None:
     """Which run: its preset, seeds, log directory and first parameters."""
     add("--preset", metavar="NAME", help=_preset_help())
     add("--seeds", type=_seeds, metavar="N-M,...", help="several runs, one after the other: 0-4 or 0,2,5; with --logdir, in DIR/seedN")
-    add("--logdir", type=Path, metavar="DIR", help="metrics, checkpoint and picture (default runs/TASK-BACKEND-seedN)")
+    add("--logdir", type=_folder, metavar="DIR", help="metrics, checkpoint and picture (default runs/TASK-BACKEND-seedN)")
     add("--from", dest="from_", type=Path, metavar="RUN", help="a new run begins with the parameters of this one, or of a checkpoint")
     add(
         "--resume",
@@ -366,15 +366,15 @@ def _real(text: str) -> float:
 
 def _seconds(text: str) -> float:
     value = _real(text)
-    if not value >= 0:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a time in seconds")
+    if not 0 <= value <= LONGEST:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a time in seconds, from 0 to {LONGEST:g}")
     return value
 
 
 def _positive(text: str) -> float:
     value = _real(text)
-    if not 0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0")
+    if not 0 < value <= LARGEST:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0 and up to {LARGEST:g}")
     return value
 
 
@@ -385,7 +385,16 @@ def _boolean(text: str) -> bool:
 
 
 def _words(text: str) -> tuple[str, ...]:
-    return tuple(word for word in text.split(",") if word)
+    words = tuple(word for word in text.split(",") if word)
+    if not words:
+        raise argparse.ArgumentTypeError(f"{text!r} names no key")
+    return words
+
+
+def _folder(text: str) -> Path:
+    if not text:
+        raise argparse.ArgumentTypeError("the name of the folder is empty")
+    return Path(text)
 
 
 def _numbers(text: str) -> list[int]:

@@ -17,12 +17,12 @@ class UserError(Exception):
 
 
 @contextmanager
-def writing(path: Path) -> Iterator[None]:
+def writing(path: Path, remedy: str = "") -> Iterator[None]:
     """What the disk refuses inside becomes a UserError that names the path."""
     try:
         yield
     except OSError as error:
-        raise UserError(f"cannot write {path}: {error.strerror or error}") from error
+        raise UserError(f"cannot write {path}: {error.strerror or error}{remedy}") from error
 
 
 def is_out_of_memory(error: BaseException) -> bool:

@@ -5,10 +5,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from train.cli import Parser
-from train.errors import UserError
-from train.files import replacing
+from train.errors import writing
+from train.files import replacing, require_place
 from train.report.page import render
 from train.report.runs import find_logdirs, read_run
+from train.words import counted
 
 DESCRIPTION = """One HTML page about one run or many, which needs no network: results, curves, predictions, configuration, machine,
 and the command that gives the same run again. Runs that differ in their seed alone are drawn as one, with their spread.
@@ -25,12 +26,12 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("logdirs", type=Path, nargs="+", metavar="LOGDIR", help="log directory of a run, or a directory that holds some")
     parser.add_argument("--out", type=Path, default=Path("report.html"), metavar="FILE", help="the page (default report.html)")
     options = parser.parse_args(arguments)
+    remedy = "; choose another file with --out"
+    with writing(options.out, remedy):
+        require_place(options.out)
     runs = [read_run(logdir) for logdir in find_logdirs(options.logdirs)]
     page = render(runs, time.time()).encode("utf-8", "replace")  # The name of a log directory need not be text.
-    try:
-        with replacing(options.out) as file:
-            file.write(page)
-    except OSError as error:
-        raise UserError(f"cannot write {options.out}: {error.strerror}; choose another file with --out") from error
-    print(f"{options.out}: {len(runs)} {'run' if len(runs) == 1 else 'runs'}, {len(page) / 1000:,.0f} kB")
+    with writing(options.out, remedy), replacing(options.out) as file:
+        file.write(page)
+    print(f"{options.out}: {counted(len(runs), 'run')}, {len(page) / 1000:,.0f} kB")
     return 0

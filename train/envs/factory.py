@@ -166,6 +166,9 @@ def _make_own(task: str, module_name: str, name: str, render: bool, arguments: M
 
 def _import_own(task: str, module_name: str) -> Any:
     """A module of the user's. A console script does not look for modules where it is started; they usually lie there."""
+    if module_name.startswith(".") or "/" in module_name or module_name.endswith(".py"):
+        module = Path(module_name).name.removesuffix(".py") or "my_module"
+        raise UserError(f"unknown task {task!r}: {module_name!r} is a file, and a task names a module, as `import` does: {module}:make_env")
     here = str(Path.cwd())
     if here not in sys.path and "" not in sys.path:
         sys.path.insert(0, here)
