@@ -227,7 +227,10 @@ def test_evaluation_uses_those_of_the_checkpoint_or_others(
 ) -> None:
     monkeypatch.setattr(train.setup, "learner_class", lambda backend: FakeLearner)
     monkeypatch.setattr(FakeLearner, "load_state_dict", lambda self, state: None)
-    checkpoint = save_checkpoint(tmp_path, CONFIG, SPACES, task=TASK, env_arg={"size": 3, "name": "saved"}, time_limit=5)
+    known = make_env(TASK).translation
+    arguments = {"size": 3, "name": "saved"}
+    checkpoint = save_checkpoint(tmp_path, CONFIG, SPACES, translation=known, task=TASK, env_arg=arguments, time_limit=5)
+    Adjustable.made.clear()
     assert main(["eval", str(checkpoint), "--episodes", "1", "--json", str(tmp_path / "out.json"), *words]) == 0
     assert all(entry == made for entry in Adjustable.made)
     result = json.loads((tmp_path / "out.json").read_text())
@@ -238,7 +241,8 @@ def test_evaluation_uses_those_of_the_checkpoint_or_others(
 def test_another_task_has_arguments_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(train.setup, "learner_class", lambda backend: FakeLearner)
     monkeypatch.setattr(FakeLearner, "load_state_dict", lambda self, state: None)
-    checkpoint = save_checkpoint(tmp_path, CONFIG, SPACES, task=TASK, env_arg={"size": 3}, time_limit=2)
+    known = make_env(TASK).translation
+    checkpoint = save_checkpoint(tmp_path, CONFIG, SPACES, translation=known, task=TASK, env_arg={"size": 3}, time_limit=2)
     arguments = ["eval", str(checkpoint), "--episodes", "1", "--json", str(tmp_path / "out.json")]
     assert main([*arguments, "--task", "train_fakes:Counting"]) == 0
     result = json.loads((tmp_path / "out.json").read_text())

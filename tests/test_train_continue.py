@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from train_agents import random_learner_state
+from train_agents import plain_translation, random_learner_state
 from train_fakes import FakeLearner
 from train_runs import Make, batches, run_quietly
 
@@ -203,7 +203,8 @@ def test_a_forged_command_names_no_code_and_no_other_place(capsys: pytest.Captur
 def agent_checkpoint(logdir: Path, config: Any, spaces: Spaces = SPACES, **changes: Any) -> Path:
     options = Options(backend="jax", config=config, logdir=logdir, steps=1000, task="gym:CartPole-v1")
     counters = {"records": 1000, "policy_steps": 9, "train_steps": 7}
-    info = {"identity": options.identity(), "spaces": spaces.to_json(), "backend": "jax", "counters": counters}
+    given = {"spaces": spaces.to_json(), "translation": plain_translation(spaces).to_json()}
+    info = {"identity": options.identity(), **given, "backend": "jax", "counters": counters}
     return checkpoint.save(logdir, 1000, random_learner_state(config, spaces) | changes, {}, info, keep=2)
 
 

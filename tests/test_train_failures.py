@@ -80,7 +80,7 @@ def test_no_more_attempts_than_failures_are_allowed(tmp_path: Path) -> None:
 def test_a_trial_finds_the_spaces_and_slow_steps(task: str, deserves: bool) -> None:
     trial = try_out(functools.partial(make_env, f"train_fakes:{task}"), pytest.fail, seed=0)
     assert trial.task == f"train_fakes:{task}"
-    assert trial.spaces == make_env("train_fakes:Counting").spaces
+    assert trial.translation.spaces == make_env("train_fakes:Counting").spaces
     assert trial.deserves_process == deserves
 
 

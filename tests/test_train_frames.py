@@ -54,5 +54,5 @@ def test_both_together_are_a_warning() -> None:
 
 @pytest.mark.parametrize(("repeat", "count"), [(1, 0), (4, 1)])
 def test_a_run_warns_once(make: Make, capsys: pytest.CaptureFixture[str], repeat: int, count: int) -> None:
-    loop.run(make(task="gym:Skipping0-v0", action_repeat=repeat), FakeLearner)
+    loop.run(make(task="gym:Skipping0-v0", action_repeat=repeat, processes="no"), FakeLearner)
     assert capsys.readouterr().out.count("each action lasts 16 frames") == count

@@ -92,6 +92,6 @@ def test_they_are_logged_with_episodes_and_evaluations(make: Make, processes: st
 
 def test_a_name_that_is_not_there_is_said_once(make: Make, capsys: pytest.CaptureFixture[str]) -> None:
     loop.run(make(task="test_train_info:Judged", info_metrics="is_succes,parts/*"), FakeLearner)
-    (warning,) = [line for line in capsys.readouterr().out.splitlines() if "WARNING" in line]
-    assert "is_succes" in warning
+    (warning,) = [line for line in capsys.readouterr().out.splitlines() if "is_succes" in line]
+    assert "WARNING" in warning
     assert "--info-metrics" in warning
