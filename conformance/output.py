@@ -31,6 +31,8 @@ def never_fail() -> None:
             os.fstat(descriptor)
         except OSError:
             os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # Gets the lowest number that is free: this one.
+    sys.stdout = sys.stdout or sys.__stdout__ or os.fdopen(1, "w", closefd=False)  # None where its descriptor was closed
+    sys.stderr = sys.stderr or sys.__stderr__ or os.fdopen(2, "w", closefd=False)
     if sys.stdout is sys.__stdout__ and isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout = _unfailing(sys.stdout)
     if sys.stderr is sys.__stderr__ and isinstance(sys.stderr, io.TextIOWrapper):

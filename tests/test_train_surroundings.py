@@ -247,6 +247,13 @@ def test_the_kit_says_what_it_can_and_writes_its_files(tmp_path: Path) -> None:
     assert (tmp_path / "page").stat().st_size
 
 
+@pytest.mark.parametrize("redirection", [">&-", "2>&-", "<&- >&- 2>&-"])
+def test_the_kit_goes_on_where_its_outputs_are_closed(redirection: str) -> None:
+    command = ["sh", "-c", f'exec "$@" {redirection}', "sh", sys.executable, "-m", "conformance.cli", *CHECK]
+    process = subprocess.run(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    assert (process.returncode, process.stderr) == (0, "")
+
+
 HARD = """
 import numpy as np
 
