@@ -26,17 +26,22 @@ def never_fail() -> None:
     null device: otherwise the next file to be opened would get its number, and what libraries print. Streams that somebody else has put
     in place of the process's own, as notebooks and tests do, stay as they are.
     """
-    for descriptor in (0, 1, 2):
-        try:
-            os.fstat(descriptor)
-        except OSError:
-            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # Gets the lowest number that is free: this one.
+    open_descriptors()
     sys.stdout = sys.stdout or sys.__stdout__ or os.fdopen(1, "w", closefd=False)  # None where its descriptor was closed
     sys.stderr = sys.stderr or sys.__stderr__ or os.fdopen(2, "w", closefd=False)
     if sys.stdout is sys.__stdout__ and isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout = _unfailing(sys.stdout)
     if sys.stderr is sys.__stderr__ and isinstance(sys.stderr, io.TextIOWrapper):
         sys.stderr = _unfailing(sys.stderr)
+
+
+def open_descriptors() -> None:
+    """Opens those of 0, 1 and 2 that are closed on the null device."""
+    for descriptor in (0, 1, 2):
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # Gets the lowest number that is free: this one.
 
 
 def _unfailing(stream: io.TextIOWrapper) -> TextIO:

@@ -76,6 +76,18 @@ def test_a_second_signal_ends_the_process_at_once(
     ends(place)
 
 
+@pytest.mark.parametrize("number", [INT, TERM])
+@pytest.mark.covers("LOOP-48")
+def test_an_environment_cannot_keep_the_signals(tmp_path: Path, number: signal.Signals) -> None:
+    """Libraries put in handlers of their own, or block signals for their threads."""
+    process = start("Grasping", tmp_path / "run", *NO, "--steps", "1000000")
+    arrived(process, tmp_path / "run")
+    process.send_signal(number)
+    out, error = process.communicate(timeout=60)
+    assert (process.returncode, error) == (130, "")
+    assert "interrupted at step" in out
+
+
 @pytest.mark.covers("LOOP-48")
 def test_two_signals_within_one_call_of_a_library_are_two(tmp_path: Path) -> None:
     """As in a compilation before training."""
@@ -113,6 +125,21 @@ def test_a_signal_in_the_last_evaluation_ends_with_a_word(tmp_path: Path, number
     assert line.startswith(f"interrupted in the last evaluation, all training is saved in {logdir}/checkpoints/000000000060")
     again = start("Counting", logdir, *NO)
     assert again.wait(60) == 2, "another task"
+
+
+@pytest.mark.parametrize("processes", [NO, YES])
+@pytest.mark.covers("LOOP-45", "LOOP-52")
+def test_what_an_environment_does_to_its_process_does_not_reach_the_run(tmp_path: Path, processes: tuple[str, ...]) -> None:
+    """Its working directory, its outputs, its threads: a relative log directory is found, and no word goes into a file of the run."""
+    logdir = tmp_path / "run"
+    process = start("Unruly", Path(os.path.relpath(logdir, ROOT)), *processes, ARRIVED=str(tmp_path / "arrived"))
+    process.communicate(timeout=60)
+    assert process.returncode == 0
+    assert finished(tmp_path)
+    assert b"steps" not in b"".join(path.read_bytes()[:64] for path in (logdir / "replay").iterdir())
+    again = start("Unruly", logdir, "--steps", "90", *processes)
+    out, error = again.communicate(timeout=60)
+    assert again.returncode == 0, out + error
 
 
 # Workers end with their trainer

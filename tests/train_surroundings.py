@@ -3,8 +3,10 @@
 import ctypes
 import hashlib
 import os
+import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -26,7 +28,7 @@ from train_surroundings import arrive
 setup.learner_class = lambda backend: FakeLearner
 if "PREFLIGHT" in os.environ:
     setup._preflight = lambda *arguments: arrive(os.environ["PREFLIGHT"])
-sys.exit(cli.main(sys.argv[1:]))
+cli.command()
 """
 
 
@@ -91,6 +93,41 @@ class Evaluated(Counting):
         if Evaluated.steps > 60:
             arrive("")
             time.sleep(0.05)
+        return super().step(action)
+
+
+class Grasping(Counting):
+    """Ignores and blocks the signals of the process that it is in, once."""
+
+    done = False
+
+    def step(self, action: np.ndarray) -> Any:
+        if self.done:
+            arrive("")
+            time.sleep(0.01)
+        elif self._episode:
+            Grasping.done = True
+            for number in (signal.SIGINT, signal.SIGTERM):
+                signal.signal(number, signal.SIG_IGN)
+            signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT, signal.SIGTERM])
+        return super().step(action)
+
+
+class Unruly(Counting):
+    """Goes elsewhere, closes the outputs and puts another in their place, and leaves a thread behind: once in a process."""
+
+    done = False
+
+    def step(self, action: np.ndarray) -> Any:
+        if self._episode == 1 and not Unruly.done:
+            Unruly.done = True
+            os.chdir("/")
+            for descriptor in (1, 2):
+                os.close(descriptor)
+            sys.stdout = object()  # type: ignore[assignment]
+            threading.Thread(target=time.sleep, args=(1000,)).start()
+        if Unruly.done:
+            assert os.getcwd() == "/"
         return super().step(action)
 
 

@@ -6,9 +6,11 @@ from train import before_numpy  # noqa: F401
 import argparse
 import importlib
 import importlib.util
+import os
 import re
 import shlex
 import sys
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
@@ -77,6 +79,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt as error:
         print(f"train: interrupted {error}".rstrip(), file=sys.stderr)
         return 130
+
+
+def command() -> None:
+    """The process of the command `train`. It ends when `main` does, whatever threads an environment has left behind."""
+    code = main()
+    left = [thread.name for thread in threading.enumerate() if thread is not threading.main_thread() and not thread.daemon]
+    if left:
+        print(f"train: ending without {', '.join(left)}, which somebody's code has left running", file=sys.stderr)
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+    sys.exit(code)
 
 
 def say_error(error: UserError, where: str = "") -> None:

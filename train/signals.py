@@ -35,6 +35,13 @@ class Signals:
         finally:
             self.is_polled = before
 
+    def take_back(self) -> None:
+        if not self.received:
+            for number in self._previous:
+                signal.signal(number, self._receive)
+            if hasattr(signal, "pthread_sigmask"):
+                signal.pthread_sigmask(signal.SIG_UNBLOCK, self._previous)
+
     @contextlib.contextmanager
     def _caught(self) -> Iterator[None]:
         ours, theirs = socket.socketpair()
@@ -110,6 +117,12 @@ def stoppable() -> Iterator[Signals]:
             yield signals
     finally:
         _active.remove(signals)
+
+
+def take_back() -> None:
+    """After code of others, which may have put in handlers of its own, or blocked the signals."""
+    if _active and threading.current_thread() is threading.main_thread():
+        _active[-1].take_back()
 
 
 @contextlib.contextmanager

@@ -14,6 +14,7 @@ from gymnasium.vector.utils import CloudpickleWrapper
 
 from train.envs.adapter import ContractEnv
 from train.envs.failure import Failure, attempt
+from train.envs.guest import guest
 from train.envs.process import DYING, begin_worker, ended, no_answer, not_started, start_method
 from train.envs.spaces import random_actions
 from train.signals import unbroken
@@ -65,8 +66,13 @@ def make_here(make: Make, tell: Tell, task: str = "") -> ContractEnv:
     Raises:
       UserError: it cannot be made in three attempts.
     """
+
+    def make_once() -> ContractEnv | Failure:
+        with guest():
+            return attempt(lambda: make(0), 0, lambda: _place(task, "when it was made"))
+
     attempts = 0
-    while isinstance(made := attempt(lambda: make(0), 0, lambda: _place(task, "when it was made")), Failure):
+    while isinstance(made := make_once(), Failure):
         attempts += 1
         _require_another(made, attempts, tell)
     return made

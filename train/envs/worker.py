@@ -15,6 +15,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 
 from train.envs.adapter import ContractEnv, where
 from train.envs.failure import Failure
+from train.envs.guest import guest
 from train.envs.history import History
 from train.envs.process import DYING, ended, no_answer, not_started, start_method
 from train.envs.stream import Step, Stream
@@ -49,12 +50,14 @@ class InProcess:
     def receive(self) -> Step | Failure:
         """What followed."""
         assert self._work is not None, "nothing was sent off"
-        step = self._work()
+        with guest():
+            step = self._work()
         return step[4].get("failure", step)
 
     def shut(self) -> None:
         """Asks the environment to close. After this and `kill`, `begin` makes a new one."""
-        self._stream.shut()
+        with guest():
+            self._stream.shut()
 
     def kill(self, deadline: float) -> None:
         """Ends what has not ended by itself at the deadline, by `time.monotonic`."""
