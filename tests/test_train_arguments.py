@@ -18,6 +18,8 @@ from train import about, arguments, loop
 from train.checkpoint import open_checkpoint
 from train.cli import main, parse
 from train.envs import ContractEnv, make_env
+from train.envs.failure import Failure
+from train.envs.trial import make_here
 from train.errors import UserError
 from train.policy import Policy, save
 from train.report.page import render
@@ -40,6 +42,16 @@ class Adjustable(train_fakes.Endless):
         if not isinstance(size, int):
             raise ValueError(f"size must be a number, not {size}")
         self.made.append({"size": size, "name": name})
+
+
+class Moody(Adjustable):
+    refusals = 2
+
+    def __init__(self, size: int) -> None:
+        if Moody.refusals:
+            Moody.refusals -= 1
+            raise ValueError("not now")
+        super().__init__(size)
 
 
 class Limited(train_fakes.Endless):
@@ -145,6 +157,15 @@ def test_what_an_environment_does_not_take_is_named(task: str, given: dict[str, 
         make_env(task, arguments=given)
     for word in (task, *words):
         assert word in str(error.value)
+
+
+def test_an_environment_that_refuses_its_arguments_now_and_then_is_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only a keyword that it does not have is certain to be refused again."""
+    monkeypatch.setattr(Moody, "refusals", 2)
+    told: list[Failure] = []
+    env = make_here(lambda index: make_env("test_train_arguments:Moody", index, arguments={"size": 3}), told.append)
+    assert env.spaces
+    assert ["--env-arg size=3: ValueError: not now" in failure.message for failure in told] == [True, True]
 
 
 def test_an_error_without_arguments_stays_what_it_is() -> None:

@@ -115,6 +115,10 @@ def _make_gymnasium(task: str, name: str, render: bool, arguments: Mapping[str, 
         raise UserError(f"task {task}: {error}; set it to egl, osmesa or disabled, or unset it") from error
 
 
+class Refusal(UserError):
+    """An environment could not be made with its arguments. Not certainly because of them: another attempt may do better."""
+
+
 @contextlib.contextmanager
 def _naming(task: str, arguments: Mapping[str, Any]) -> Iterator[None]:
     """What the code of an environment raises of keyword arguments that it cannot use becomes a line that names them."""
@@ -123,8 +127,10 @@ def _naming(task: str, arguments: Mapping[str, Any]) -> Iterator[None]:
     except (TypeError, ValueError, LookupError, AttributeError, AssertionError) as error:
         if not arguments:
             raise
-        details = "" if "keyword argument" in str(error) else traceback.format_exc()
-        raise UserError(f"task {task}{_given(arguments)}: {type(error).__name__}: {error}", details) from error
+        line = f"task {task}{_given(arguments)}: {type(error).__name__}: {error}"
+        if "keyword argument" in str(error):
+            raise UserError(line) from error
+        raise Refusal(line, traceback.format_exc()) from error
 
 
 def _given(arguments: Mapping[str, Any]) -> str:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Literal, TypeVar
 
 from train.envs.adapter import Garbage
+from train.envs.factory import Refusal
 from train.errors import UserError
 from train.signals import Stopped
 
@@ -48,8 +49,8 @@ def attempt(work: Callable[[], Result], worker: int, place: Callable[[], str]) -
     try:
         return work()
     except UserError as error:
-        is_invalid = isinstance(error, Garbage)
-        return Failure(worker, "garbage" if is_invalid else "error", str(error), error.details, certain=not is_invalid)
+        kind: Literal["garbage", "error"] = "garbage" if isinstance(error, Garbage) else "error"
+        return Failure(worker, kind, str(error), error.details, certain=not isinstance(error, Garbage | Refusal))
     except BaseException as error:
         if isinstance(error, Stopped) or _is_the_users(error):
             raise
