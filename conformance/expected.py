@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from conformance.check import CHECKS, Check
-from conformance.errors import UserError
+from conformance.errors import UserError, read_text
 from conformance.execute import Result
 from conformance.requirements import requirements
 
@@ -43,9 +43,7 @@ def read_expected(path: Path) -> ExpectedFailures:
       UserError: the file cannot be read, or names what there is not, or gives no reason.
     """
     try:
-        entries = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror}") from error
+        entries = tomllib.loads(read_text(path))
     except ValueError as error:
         raise UserError(f"{path}: {error}") from error
     import conformance.cases  # noqa: F401 - importing registers the checks

@@ -11,7 +11,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from conformance.errors import UserError
+from conformance.errors import UserError, read_text
 from conformance.execute import FAILING, Result, Row, Settings, rows
 from conformance.expected import ExpectedFailures
 from conformance.foreign import ForeignAdapter
@@ -156,9 +156,7 @@ def read(path: Path) -> Data:
       UserError: there is none, or the file is something else.
     """
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror}") from error
+        data = json.loads(read_text(path))
     except (ValueError, RecursionError) as error:
         raise UserError(f"{path} is not JSON: {error}") from error
     if problem := misfit(data, schema()):

@@ -3,6 +3,7 @@
 import copy
 import io
 import json
+import os
 import re
 import shlex
 import types
@@ -280,6 +281,13 @@ def test_expectations_that_cannot_be_read(text: str, message: str, tmp_path: Pat
     (tmp_path / "expect.toml").write_text(text, encoding="utf-8")
     with pytest.raises(UserError, match=re.escape(message)):
         read_expected(tmp_path / "expect.toml")
+
+
+def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    for read_it in (read, read_expected):
+        with pytest.raises(UserError, match=r"cannot read .*pipe: it is no file"):
+            read_it(tmp_path / "pipe")
 
 
 def test_a_requirement_passes_unexpectedly_only_as_a_whole() -> None:

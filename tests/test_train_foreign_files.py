@@ -400,6 +400,27 @@ def test_a_training_state_that_is_not_finite_is_refused(make: Make) -> None:
     assert "params/w holds numbers that are not finite" in refused(make(steps=90))
 
 
+@pytest.mark.parametrize(("name", "value"), [("optimizer/second_moment/w", -1.0), ("optimizer/step", -5)])
+def test_an_optimizer_that_no_run_has_is_refused(make: Make, name: str, value: float) -> None:
+    loop.run(make(), FakeLearner)
+    [folder] = checkpoint.candidates(make().logdir)
+    state = files.read_arrays(folder / "learner.safetensors")
+    state[name] = np.full_like(state.get(name, np.zeros((2, 3), np.float32)), value)
+    save_file(state, folder / "learner.safetensors")
+    files.seal(folder, checkpoint.FILES)
+    assert f"{name} holds numbers below 0" in refused(make(steps=90))
+
+
+def test_what_has_the_name_of_a_checkpoint_stays_as_it_is(make: Make, tmp_path: Path) -> None:
+    loop.run(make(), FakeLearner)
+    (tmp_path / "mine").mkdir()
+    link = make().logdir / "checkpoints" / "000000000090"
+    link.symlink_to(tmp_path / "mine")
+    with pytest.raises(UserError, match=r"000000000090 is no checkpoint, and one must be written there: move it away"):
+        loop.run(make(steps=90), FakeLearner)
+    assert link.is_symlink()
+
+
 # Too large for the machine
 
 

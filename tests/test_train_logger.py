@@ -89,6 +89,14 @@ def test_another_file_is_cut_to_whole_lines(tmp_path: Path) -> None:
     assert len(logger.warnings) == 1
 
 
+def test_the_file_of_another_program_is_left_as_it_is(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.jsonl"
+    path.write_text("user\n" * 2000)
+    with pytest.raises(UserError, match=r"metrics.jsonl is not the file of this run: .* move it away"):
+        Logger(tmp_path, 7015)
+    assert path.read_text() == "user\n" * 2000
+
+
 def test_position_is_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     synced: list[int] = []
     logger = Logger(tmp_path)

@@ -151,6 +151,8 @@ def test_positive_values_that_spread_far_have_a_logarithmic_axis() -> None:
         [math.inf, 1, -math.inf],
         [1e308, -1e308, 0],
         [1e308, 1e-308, 1e-320],
+        [1e308, 1.1e308, 1.2e308],
+        [-1e308, -1e308, -1e308],
         [5e-324, 0, 0],
         [0, 0, 0],
         [-7, -7, -7],

@@ -87,10 +87,12 @@ def save(logdir: Path, step: int, learner: Mapping[str, Any], loop: Mapping[str,
     What others have put into the folder `checkpoints` or into a checkpoint stays where it is: [LOOP-52].
 
     Raises:
-      UserError: the disk refuses it.
+      UserError: the disk refuses it, or something else has its name.
     """
     directory = logdir / "checkpoints"
     final = directory / name_of(step)
+    if os.path.lexists(final) and (final.is_symlink() or not _holds_any(final)):
+        raise UserError(f"{final} is no checkpoint, and one must be written there: move it away")
     try:
         temporary = new_folder(final)
         save_file(_contiguous(_single_precision(learner)), temporary / "learner.safetensors")

@@ -39,8 +39,8 @@ def hold(logdir: Path, stack: ExitStack) -> None:
             lock.acquire()
         except filelock.Timeout as error:
             raise UserError(f"another process is training in {logdir}; let it end, or choose another with --logdir") from error
-        except (NotImplementedError, OSError):
-            if not os.access(logdir, os.W_OK):
+        except (NotImplementedError, OSError) as error:
+            if isinstance(error, PermissionError) or not os.access(logdir, os.W_OK):
                 raise
             return  # Some network file systems have no locks: there it is left to the user.
         stack.callback(lock.release)

@@ -40,7 +40,7 @@ class Logger:
     warnings: what was wrong with the file.
 
     Raises:
-      UserError: the disk refuses it, or Weights & Biases is not installed or does not let us in.
+      UserError: the disk refuses it, the file is another program's, or Weights & Biases is not installed or does not let us in.
     """
 
     def __init__(self, logdir: Path, position: int | None = None, *, wandb: str | None = None, about: About | None = None) -> None:
@@ -108,12 +108,18 @@ def _open_log(path: Path) -> BinaryIO:
 
 
 def _cut(file: BinaryIO, path: Path, position: int) -> list[str]:
-    """Cuts metrics.jsonl back to so many bytes, and to whole lines if it is not what it was. Returns what is to be said about it."""
+    """Cuts metrics.jsonl back to so many bytes, and to whole lines if it is not what it was. Returns what is to be said about it.
+
+    Raises:
+      UserError: what would be kept does not end in a line of metrics, so it is somebody else's file; it is left as it is.
+    """
     size = file.seek(0, os.SEEK_END)
-    file.truncate(min(size, position))
-    rest = _tail(file).rpartition(b"\n")[2]
+    lines, _, rest = _tail(file, position).rpartition(b"\n")
     kept = min(size, position) - len(rest)
+    if kept and _numbers(lines.rpartition(b"\n")[2]) is None:
+        raise UserError(f"{path} is not the file of this run: its last line within {position:,} bytes is no metrics; move it away")
     if kept == position:
+        file.truncate(kept)
         return []
     file.truncate(kept)
     return [f"{path} has {size:,} bytes, and {position:,} belong to the checkpoint; {kept:,} bytes of whole lines were kept"]
@@ -127,10 +133,11 @@ def _last_step(file: BinaryIO) -> int | None:
     return None
 
 
-def _tail(file: BinaryIO) -> bytes:
-    """The end of a file, longer than any line of ours."""
-    file.seek(max(0, file.seek(0, os.SEEK_END) - 2**20))
-    return file.read()
+def _tail(file: BinaryIO, end: float = math.inf) -> bytes:
+    """What stands before so many bytes of a file, longer than any line of ours."""
+    end = min(end, file.seek(0, os.SEEK_END))
+    start = file.seek(max(0, int(end) - 2**20))
+    return file.read(int(end) - start)
 
 
 class _TensorBoard:

@@ -21,6 +21,7 @@ from train.files import Arrays
 from train.state import Counters
 
 COUNT = {"type": "count"}
+FAR = COUNT | {"maximum": 2**53}  # no run comes to it, and no counter that goes on from it leaves 64 bits
 NUMBER = {"type": "finite"}
 CREDIT = r"[0-9]{1,700}(/[1-9][0-9]{0,700})?"  # a remainder of time steps, exactly: the smallest ratio has a denominator of 2**1074
 
@@ -36,7 +37,7 @@ SCHEMA: dict[str, Any] = {
         "spaces": {"type": "object", "additionalProperties": {"type": "object"}},
         "translation": _object({"observations": {"type": "object"}, "actions": {"type": "object"}, "left_out": {"type": "array"}}),
         "backend": {"type": "string", "maxLength": 100},
-        "counters": _object({name: NUMBER | {"minimum": 0} if kind is float else COUNT for name, kind in Counters.__annotations__.items()}),
+        "counters": _object({name: NUMBER | {"minimum": 0} if kind is float else FAR for name, kind in Counters.__annotations__.items()}),
         "environments": {"type": "array", "items": {"anyOf": [{"type": "null"}, _object({"seed": COUNT, "episode": COUNT})]}},
         "replay_ratio": _object(
             {"step": {"anyOf": [{"type": "null"}, COUNT]}, "credit": {"type": "string", "pattern": f"^{CREDIT}$", "maxLength": 1402}}
@@ -139,6 +140,8 @@ def check_arrays(saved: Checkpoint, spaces: Spaces, config: Config, workers: int
     for name, array in saved.learner.items():
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             raise _unfit(saved, f"learner.safetensors: {name} holds numbers that are not finite")
+        if name.startswith(("optimizer/second_moment/", "optimizer/step")) and np.any(array < 0):
+            raise _unfit(saved, f"learner.safetensors: {name} holds numbers below 0")
 
 
 def _batch_forms(spaces: Spaces, config: Config) -> dict[str, Form]:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from conformance.check import relative_deviation, scale_of
-from conformance.errors import UserError
+from conformance.errors import UserError, read_text
 from conformance.vectors.format import FORMAT, Table, read_npz
 
 
@@ -44,8 +44,8 @@ def read_index(directory: Path) -> dict[str, Any]:
       UserError: there is none, or it has another format.
     """
     try:
-        index: dict[str, Any] = json.loads((directory / "index.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        index: dict[str, Any] = json.loads(read_text(directory / "index.json"))
+    except (UserError, ValueError) as error:
         raise UserError(
             f"no vectors in {directory}: it has no index.json that can be read; write some with: conformance vectors --out {directory}"
         ) from error

@@ -199,7 +199,7 @@ def vertical_axis(low: float, high: float, frame: Frame, log: bool) -> Axis:
     start, stop = frame.height - frame.bottom, frame.top
     if log:
         return Axis(low / 1.1, high * 1.1, start, stop, log=True)
-    low, high = max(low, -LARGEST_NUMBER), min(high, LARGEST_NUMBER)
+    low, high = (min(max(end, -LARGEST_NUMBER), LARGEST_NUMBER) for end in (low, high))
     if 0 < low < high / 3:
         low = 0.0
     room = max(0.05 * (high - low) or 0.05 * abs(high) or 1.0, SMALLEST_ROOM)
