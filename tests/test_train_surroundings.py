@@ -142,6 +142,14 @@ def test_what_an_environment_does_to_its_process_does_not_reach_the_run(tmp_path
     assert again.returncode == 0, out + error
 
 
+def test_a_working_directory_that_is_removed_does_not_end_a_run(tmp_path: Path) -> None:
+    (tmp_path / "home").mkdir()
+    process = start("Homeless", tmp_path / "run", *NO, shell=f'cd {tmp_path / "home"}; exec "$@"', PYTHONPATH=f"{ROOT}:{ROOT / 'tests'}")
+    _, error = process.communicate(timeout=60)
+    assert process.returncode == 0, error
+    assert finished(tmp_path)
+
+
 # Workers end with their trainer
 
 

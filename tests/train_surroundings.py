@@ -99,14 +99,14 @@ class Evaluated(Counting):
 class Grasping(Counting):
     """Ignores and blocks the signals of the process that it is in, once."""
 
-    done = False
+    done = mine = False
 
     def step(self, action: np.ndarray) -> Any:
-        if self.done:
+        if self.mine:  # Its turn before this one has ended.
             arrive("")
             time.sleep(0.01)
-        elif self._episode:
-            Grasping.done = True
+        elif self._episode and not Grasping.done:
+            Grasping.done = self.mine = True
             for number in (signal.SIGINT, signal.SIGTERM):
                 signal.signal(number, signal.SIG_IGN)
             signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT, signal.SIGTERM])
@@ -128,6 +128,18 @@ class Unruly(Counting):
             threading.Thread(target=time.sleep, args=(1000,)).start()
         if Unruly.done:
             assert os.getcwd() == "/"
+        return super().step(action)
+
+
+class Homeless(Counting):
+    """Removes the directory that the run was started in."""
+
+    done = False
+
+    def step(self, action: np.ndarray) -> Any:
+        if not Homeless.done:
+            Homeless.done = True
+            os.rmdir(os.getcwd())
         return super().step(action)
 
 

@@ -51,7 +51,7 @@ class Logger:
             last = _last_step(self._file)
             self._file.seek(0, os.SEEK_END)
         with writing(logdir):
-            self._tensorboard = _TensorBoard(logdir, last)
+            self._tensorboard = _TensorBoard(logdir.absolute(), last)  # a thread opens its files
         self._wandb = _Wandb(logdir, wandb, about or {}) if wandb else None
 
     def write(self, step: int, seconds: float, metrics: Mapping[str, float]) -> None:

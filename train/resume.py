@@ -116,7 +116,7 @@ def restore_replay(
     Raises:
       Unreadable: the buffer is away or cannot be read now. Nothing has changed.
     """
-    directory, config = options.logdir / "replay", options.config
+    directory, config = options.logdir.absolute() / "replay", options.config
     description: Any = saved.info["replay"]
     for older in [saved.path, *(path for path in checkpoint.candidates(options.logdir) if path.name < saved.path.name)]:
         is_own = older == saved.path

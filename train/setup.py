@@ -252,7 +252,7 @@ def _open_replay(
     options: Options, saved: Checkpoint | None, envs: Environments, display: Display
 ) -> tuple[Prefetcher, Record | None, bool]:
     """The buffer in LOGDIR/replay, the records of the environments if they were restored, and whether it is the checkpoint's own buffer."""
-    config, directory = options.config, options.logdir / "replay"
+    config, directory = options.config, options.logdir.absolute() / "replay"  # a thread reads there
     settings: dict[str, Any] = {
         "memory_limit": int(options.replay_memory * 2**30),
         "deter_dtype": options.replay_deter,

@@ -175,9 +175,10 @@ def _import_own(task: str, module_name: str) -> Any:
     if module_name.startswith(".") or "/" in module_name or module_name.endswith(".py"):
         module = Path(module_name).name.removesuffix(".py") or "my_module"
         raise UserError(f"unknown task {task!r}: {module_name!r} is a file, and a task names a module, as `import` does: {module}:make_env")
-    here = str(Path.cwd())
-    if here not in sys.path and "" not in sys.path:
-        sys.path.insert(0, here)
+    with contextlib.suppress(FileNotFoundError):  # It has been removed.
+        here = str(Path.cwd())
+        if here not in sys.path and "" not in sys.path:
+            sys.path.insert(0, here)
     try:
         return importlib.import_module(module_name)
     except ModuleNotFoundError as error:

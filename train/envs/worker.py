@@ -50,8 +50,7 @@ class InProcess:
     def receive(self) -> Step | Failure:
         """What followed."""
         assert self._work is not None, "nothing was sent off"
-        with guest():
-            step = self._work()
+        step = self._work()
         return step[4].get("failure", step)
 
     def shut(self) -> None:
@@ -172,11 +171,15 @@ def receive(workers: Mapping[int, Worker]) -> dict[int, Step | Failure]:
     """The answers of these workers, in the order given. They are waited for together, as long as the most patient of them allows."""
     answers: dict[int, Step | Failure] = {}
     waiting: dict[connection.Connection, tuple[int, OwnProcess]] = {}
+    here: dict[int, Worker] = {}
     for index, worker in workers.items():
         if isinstance(worker, OwnProcess) and worker.pipe is not None:
             waiting[worker.pipe] = index, worker
         else:
-            answers[index] = worker.receive()
+            here[index] = worker
+    if here:
+        with guest():  # once for all of them: it takes as long as a step of a simple environment
+            answers |= {index: worker.receive() for index, worker in here.items()}
     deadline = time.monotonic() + max((worker.patience for _, worker in waiting.values()), default=0.0)
     while waiting:
         ready: list[Any] = connection.wait(list(waiting), _left(deadline))
