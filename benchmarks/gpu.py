@@ -1,9 +1,11 @@
-"""Everything to run once on a machine with an accelerator: `python -m benchmarks.gpu --out FOLDER`, ten minutes at most.
+"""Everything to run once on a machine with an accelerator: `python -m benchmarks.gpu --out FOLDER`, ten minutes at
+most.
 
-Conformance of both backends on the device in float32 and bfloat16, the train-step benchmark at 12m and 200m, and a short training with its
-learning curve. Needs no network and no installation: the repository on PYTHONPATH, and the packages present. Conformance runs share
-the machine, everything else has it alone. Each part is a process with its share of the time; one that fails or runs out of time is recorded
-as such, and the others go on. With `--small` the same parts run with sizes that a CPU manages.
+Conformance of both backends on the device in float32 and bfloat16, the train-step benchmark at 12m and 200m, and a
+short training with its learning curve. Needs no network and no installation: the repository on PYTHONPATH, and the
+packages present. Conformance runs share the machine, everything else has it alone. Each part is a process with its
+share of the time; one that fails or runs out of time is recorded as such, and the others go on. With `--small` the same
+parts run with sizes that a CPU manages.
 """
 
 import argparse
@@ -17,7 +19,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from train.machine import describe
+from dreamer_spec.machine import describe
 
 Part = tuple[str, list[str]]
 GRACE = 20.0  # seconds that an interrupted training has for its checkpoint
@@ -40,11 +42,15 @@ def stages(out: Path, backends: list[str], device: str | None, small: bool) -> l
 
     def training(backend: str) -> Part:
         name, steps = f"training-{backend}", "1500" if small else "10000"
-        return name, ["-m", "train", "--backend", backend, "--steps", steps, "--logdir", str(out / name), *where]
+        return name, ["-m", "dreamer_spec", "--backend", backend, "--steps", steps, "--logdir", str(out / name), *where]
 
     return [
         [conformance(backend, dtype) for dtype in ("float32", "bfloat16") for backend in backends],
-        *([train_step(backend, size)] for size in (("tiny", "1m") if small else ("12m", "200m")) for backend in backends),
+        *(
+            [train_step(backend, size)]
+            for size in (("tiny", "1m") if small else ("12m", "200m"))
+            for backend in backends
+        ),
         *([training(backend)] for backend in backends),
     ]
 
@@ -72,10 +78,14 @@ def run_part(part: Part, out: Path, seconds: float) -> dict[str, Any]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__.splitlines()[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
+    )
     parser.add_argument("--out", type=Path, required=True, help="folder for JSON, logs and pictures")
     parser.add_argument("--backends", nargs="+", default=["jax", "torch"])
-    parser.add_argument("--device", default=None, help="device as the backends name it; default: the backend's own choice")
+    parser.add_argument(
+        "--device", default=None, help="device as the backends name it; default: the backend's own choice"
+    )
     parser.add_argument("--minutes", type=float, default=9.0, help="time for everything")
     parser.add_argument("--small", action="store_true", help="sizes for a CPU")
     parser.add_argument("--only", default="", help="only parts whose name contains this")

@@ -2,8 +2,8 @@
 
     python -m benchmarks.learning --out FOLDER/NAME -- OPTIONS OF TRAIN
 
-Everything after `--` goes to `train` as it is. Writes NAME.json (command, machine, and the points of every curve) and NAME.png (returns,
-and a panel for each of `--metrics`). A run that has come to its end in `--logdir` is not repeated.
+Everything after `--` goes to `train` as it is. Writes NAME.json (command, machine, and the points of every curve) and
+NAME.png (returns, and a panel for each of `--metrics`). A run that has come to its end in `--logdir` is not repeated.
 """
 
 import argparse
@@ -21,9 +21,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, FormatStrFormatter
 
 from benchmarks.machine import command
-from train.curve import BLUE, GRAY, ORANGE
-from train.logger import iterate_metrics
-from train.machine import describe
+from dreamer_spec.curve import BLUE, GRAY, ORANGE
+from dreamer_spec.logger import iterate_metrics
+from dreamer_spec.machine import describe
 
 COLORS = {"jax": BLUE, "torch": ORANGE}
 EVALUATION, EPISODES = "evaluation/return", "episode/return"
@@ -36,9 +36,24 @@ def train(backend: str, seed: int, logdir: Path, arguments: list[str]) -> None:
     Raises:
       RuntimeError: the run failed.
     """
-    run = [sys.executable, "-m", "train", "--backend", backend, "--seed", str(seed), "--logdir", str(logdir), *arguments]
+    run = [
+        sys.executable,
+        "-m",
+        "dreamer_spec",
+        "--backend",
+        backend,
+        "--seed",
+        str(seed),
+        "--logdir",
+        str(logdir),
+        *arguments,
+    ]
     made = logdir / "made.json"
-    if (logdir / "curve.png").exists() and made.exists() and json.loads(made.read_text(encoding="utf-8"))["arguments"] == arguments:
+    if (
+        (logdir / "curve.png").exists()
+        and made.exists()
+        and json.loads(made.read_text(encoding="utf-8"))["arguments"] == arguments
+    ):
         return
     logdir.mkdir(parents=True, exist_ok=True)
     made.write_text(json.dumps({"arguments": arguments, "machine": describe()}), encoding="utf-8")
@@ -56,12 +71,19 @@ def points(logdir: Path, metrics: list[str]) -> dict[str, Any]:
     Evaluations are all there; episodes and metrics are means over equal stretches of the run.
     """
     lines = [line for line in iterate_metrics(logdir / "metrics.jsonl") if line]
-    curves = {EVALUATION: column(lines, EVALUATION), **{name: means(column(lines, name)) for name in (EPISODES, *metrics)}}
+    curves = {
+        EVALUATION: column(lines, EVALUATION),
+        **{name: means(column(lines, name)) for name in (EPISODES, *metrics)},
+    }
     rounded = {
-        name: [[int(step), round(minutes, 2), float(f"{value:.4g}")] for step, minutes, value in curve] for name, curve in curves.items()
+        name: [[int(step), round(minutes, 2), float(f"{value:.4g}")] for step, minutes, value in curve]
+        for name, curve in curves.items()
     }
     machine = json.loads((logdir / "made.json").read_text(encoding="utf-8"))["machine"]
-    return rounded | {"random": next((line["random/return"] for line in lines if "random/return" in line), None), "machine": machine}
+    return rounded | {
+        "random": next((line["random/return"] for line in lines if "random/return" in line), None),
+        "machine": machine,
+    }
 
 
 def column(lines: list[dict[str, float]], name: str) -> np.ndarray:
@@ -77,7 +99,8 @@ def means(curve: np.ndarray) -> np.ndarray:
 
 
 def draw(path: Path, title: str, runs: list[dict[str, Any]], metrics: list[str]) -> None:
-    """Returns of training episodes of every run (thin) and their mean per backend (thick), evaluations (dots), and the other metrics.
+    """Returns of training episodes of every run (thin) and their mean per backend (thick), evaluations (dots), and the
+    other metrics.
 
     A run that is shorter than its first episode has no returns to draw.
     """
@@ -93,11 +116,20 @@ def draw(path: Path, title: str, runs: list[dict[str, Any]], metrics: list[str])
             if run[panel]:
                 steps, _, values = np.array(run[panel]).T
                 label = None if panel == EPISODES else f"{run['backend']}, seed {run['seed']}"
-                axes.plot(steps, values, color=COLORS[run["backend"]], alpha=0.35 if panel == EPISODES else 0.8, linewidth=1, label=label)
+                axes.plot(
+                    steps,
+                    values,
+                    color=COLORS[run["backend"]],
+                    alpha=0.35 if panel == EPISODES else 0.8,
+                    linewidth=1,
+                    label=label,
+                )
         if panel == EPISODES:
             draw_returns(axes, runs)
         if panel == panels[0]:
-            figure.legend(*axes.get_legend_handles_labels(), frameon=False, fontsize=9, loc="outside lower center", ncols=3)
+            figure.legend(
+                *axes.get_legend_handles_labels(), frameon=False, fontsize=9, loc="outside lower center", ncols=3
+            )
         axes.set_ylabel("return" if panel == EPISODES else panel.removeprefix("train/"))
         axes.set_xlabel("environment steps")
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
@@ -121,20 +153,34 @@ def draw_returns(axes: Axes, runs: list[dict[str, Any]]) -> None:
         seeds = f", mean of {len(group)} seeds" if len(group) > 1 else ""
         axes.plot(grid, mean, color=COLORS[backend], linewidth=2.5, label=f"{backend}, training episodes{seeds}")
         steps, _, values = np.array([point for run in group for point in run[EVALUATION]]).reshape(-1, 3).T
-        axes.plot(steps, values, "o", color=COLORS[backend], markersize=5, markeredgecolor="white", label=f"{backend}, evaluations")
+        axes.plot(
+            steps,
+            values,
+            "o",
+            color=COLORS[backend],
+            markersize=5,
+            markeredgecolor="white",
+            label=f"{backend}, evaluations",
+        )
     random = [run["random"] for run in runs if run["random"] is not None]
     if random:
-        axes.axhline(np.mean(random), color=GRAY, linestyle="--", linewidth=1.2, label=f"random policy ({np.mean(random):.4g})")
+        axes.axhline(
+            np.mean(random), color=GRAY, linestyle="--", linewidth=1.2, label=f"random policy ({np.mean(random):.4g})"
+        )
     axes.set_xlim(left=0)
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__.splitlines()[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
+    )
     parser.add_argument("--out", type=Path, required=True, help="path of the results without its ending")
     parser.add_argument("--title", default="", help="title of the picture")
     parser.add_argument("--backends", nargs="+", default=["jax", "torch"], choices=list(COLORS))
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
-    parser.add_argument("--metrics", nargs="*", default=[], help="metrics to draw beside the return, as train/loss/reward")
+    parser.add_argument(
+        "--metrics", nargs="*", default=[], help="metrics to draw beside the return, as train/loss/reward"
+    )
     parser.add_argument("--jobs", type=int, default=1, help="runs at once, each with its share of the cores")
     parser.add_argument("--logdir", type=Path, default=Path("runs/learning"), help="where the runs are kept")
     split = sys.argv.index("--") if "--" in sys.argv else len(sys.argv)
@@ -146,7 +192,9 @@ def main() -> int:
     shares = [set(cores[job :: options.jobs]) for job in range(options.jobs)]
     free = list(shares)
     cases = [
-        (backend, seed, options.logdir / f"{options.out.name}-{backend}-{seed}") for seed in options.seeds for backend in options.backends
+        (backend, seed, options.logdir / f"{options.out.name}-{backend}-{seed}")
+        for seed in options.seeds
+        for backend in options.backends
     ]
 
     # Linux sets affinity for one thread, and processes inherit it from the thread that starts them.
@@ -159,7 +207,10 @@ def main() -> int:
     draw(options.out.with_suffix(".png"), options.title, runs, options.metrics)
     for run in runs:
         for step, minutes, value in run[EVALUATION][-1:]:
-            print(f"{run['backend']:6} seed {run['seed']}: {value} after {step:,} steps and {minutes} minutes; random {run['random']}")
+            print(
+                f"{run['backend']:6} seed {run['seed']}: {value} after {step:,} steps and "
+                f"{minutes} minutes; random {run['random']}"
+            )
     return 0
 
 

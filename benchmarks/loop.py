@@ -1,8 +1,9 @@
 """Measures the loop of `train`: `python -m benchmarks.loop --out docs/results/loop.json`.
 
-Share: for how much of the wall time the learner computes train steps, with an environment that takes no time and with one that sleeps 20 ms
-a step in a process of its own. Memory: a run that writes many times more to the replay buffer than it may map. Each run is a process of
-its own; the numbers are those of its metrics.jsonl, the first lines (compilation) left out.
+Share: for how much of the wall time the learner computes train steps, with an environment that takes no time and with
+one that sleeps 20 ms
+a step in a process of its own. Memory: a run that writes many times more to the replay buffer than it may map. Each run
+is a process of its own; the numbers are those of its metrics.jsonl, the first lines (compilation) left out.
 """
 
 import argparse
@@ -19,8 +20,8 @@ import numpy as np
 from gymnasium import spaces as gym
 
 from benchmarks.machine import command
-from train.logger import iterate_metrics
-from train.machine import describe
+from dreamer_spec.logger import iterate_metrics
+from dreamer_spec.machine import describe
 
 EPISODE = 200
 SLOW_STEP = 0.02  # seconds
@@ -62,8 +63,28 @@ class Images(Vectors):
 
 def train(backend: str, task: str, folder: Path, *options: str) -> list[dict[str, float]]:
     """The metrics of a run without evaluations."""
-    call = [sys.executable, "-m", "train", "--backend", backend, "--task", f"benchmarks.loop:{task}", "--logdir", str(folder)]
-    quiet = ["--eval-every", "0", "--eval-episodes", "0", "--random-episodes", "0", "--no-preflight", "--log-every", "2"]
+    call = [
+        sys.executable,
+        "-m",
+        "dreamer_spec",
+        "--backend",
+        backend,
+        "--task",
+        f"benchmarks.loop:{task}",
+        "--logdir",
+        str(folder),
+    ]
+    quiet = [
+        "--eval-every",
+        "0",
+        "--eval-episodes",
+        "0",
+        "--random-episodes",
+        "0",
+        "--no-preflight",
+        "--log-every",
+        "2",
+    ]
     result = subprocess.run([*call, *quiet, *options], capture_output=True, text=True, check=False)
     if result.returncode:
         raise RuntimeError(result.stderr.strip().splitlines()[-1])
@@ -90,7 +111,18 @@ def measure_memory(backend: str, steps: int, limit: float) -> dict[str, Any]:
     """Resident memory over a run that hardly trains; limit: GiB."""
     with tempfile.TemporaryDirectory() as folder:
         directory = Path(folder) / "run"
-        model = ["--size", "tiny", "--envs", "8", "--replay-ratio", "1", "--processes", "no", "--replay-capacity", "1000000"]
+        model = [
+            "--size",
+            "tiny",
+            "--envs",
+            "8",
+            "--replay-ratio",
+            "1",
+            "--processes",
+            "no",
+            "--replay-capacity",
+            "1000000",
+        ]
         lines = train(backend, "Images", directory, "--steps", str(steps), "--replay-memory", str(limit), *model)
         written = sum(file.stat().st_blocks * 512 for file in (directory / "replay").glob("chunk-*"))
     chosen = [lines[i] for i in np.unique(np.linspace(2, len(lines) - 1, 12).astype(int))]
@@ -103,7 +135,9 @@ def measure_memory(backend: str, steps: int, limit: float) -> dict[str, Any]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__.splitlines()[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
+    )
     parser.add_argument("--backends", nargs="+", default=["jax", "torch"])
     parser.add_argument("--size", default="1m")
     parser.add_argument("--steps", type=int, default=2_500, help="of a run that measures the share")

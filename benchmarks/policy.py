@@ -1,18 +1,18 @@
 """Actions per second of a NumPy-only policy: `OPENBLAS_NUM_THREADS=1 python -m benchmarks.policy`.
 
-Vectors of 24 numbers or one RGB image in, six real numbers out, random parameters, in one environment and in 16. Seconds are those of the
-processor that the process took, so that other load on the machine counts little.
+Vectors of 24 numbers or one RGB image in, six real numbers out, random parameters, in one environment and in 16.
+Seconds are those of the processor that the process took, so that other load on the machine counts little.
 """
 
 import time
 
 import numpy as np
 
+from dreamer_spec.machine import describe
+from dreamer_spec.policy import Policy
+from dreamer_spec.saved_agent import SavedAgent, acting_table
+from dreamer_spec.translation import Entry, Translation
 from spec import Image, Spaces, Vector, load_config
-from train.machine import describe
-from train.policy import Policy
-from train.saved_agent import SavedAgent, acting_table
-from train.translation import Entry, Translation
 
 OBSERVATIONS = {"vector": Vector(24), "image of 32 x 32": Image(32, 32, 3), "image of 64 x 64": Image(64, 64, 3)}
 REPEATS, SECONDS = 5, 0.5
@@ -23,7 +23,10 @@ def rate(size: str, observed: str, rows: int) -> float:
     space = OBSERVATIONS[observed]
     spaces = Spaces({"observation": space}, {"action": Vector(6)})
     rng, config = np.random.default_rng(0), load_config("paper", size)
-    parameters = {name: rng.normal(0, 0.05, entry.shape).astype(np.float32) for name, entry in acting_table(config, spaces).items()}
+    parameters = {
+        name: rng.normal(0, 0.05, entry.shape).astype(np.float32)
+        for name, entry in acting_table(config, spaces).items()
+    }
     policy = Policy(SavedAgent(config, spaces, parameters, {}, _translation(spaces)))
     policy.reset(rows)
     shape, is_first = (rows, *space.array_shape), np.zeros(rows, bool)
@@ -40,7 +43,11 @@ def rate(size: str, observed: str, rows: int) -> float:
 
 def _translation(spaces: Spaces) -> Translation:
     (observed,) = spaces.observations.values()
-    entry = Entry((), observed.array_shape, "uint8", (0.0,), (255.0,)) if isinstance(observed, Image) else Entry((), (24,), "float32")
+    entry = (
+        Entry((), observed.array_shape, "uint8", (0.0,), (255.0,))
+        if isinstance(observed, Image)
+        else Entry((), (24,), "float32")
+    )
     return Translation(spaces, {"observation": entry}, {"action": Entry((), (6,), "float32", (-1.0,), (1.0,))})
 
 
@@ -48,7 +55,10 @@ def main() -> None:
     print(describe())
     for size in ("tiny", "1m", "12m"):
         for observed in OBSERVATIONS:
-            print(f"| {size} | {observed} | {rate(size, observed, 1):,.0f} | {rate(size, observed, 16):,.0f} |", flush=True)
+            print(
+                f"| {size} | {observed} | {rate(size, observed, 1):,.0f} | {rate(size, observed, 16):,.0f} |",
+                flush=True,
+            )
 
 
 if __name__ == "__main__":

@@ -1,13 +1,15 @@
 """Measures the replay buffer of a run: `python -m benchmarks.replay`.
 
-Records come from 16 environments; a batch is 16 sequences of 65 records. Three kinds of record: one image 64 x 64 x 3 and 24 floats with
-the latents of 12m (deter 2048, stoch 32), the same with latents of one number, and small ones (4 floats, latents of 8 numbers). Every case
-is filled first and runs in a process of its own, so that its resident memory is its own. Prints a table and with `--out` writes JSON.
+Records come from 16 environments; a batch is 16 sequences of 65 records. Three kinds of record: one image 64 x 64 x 3
+and 24 floats with the latents of 12m (deter 2048, stoch 32), the same with latents of one number, and small ones (4
+floats, latents of 8 numbers). Every case is filled first and runs in a process of its own, so that its resident memory
+is its own. Prints a table and with `--out` writes JSON.
 
-Columns `/cpu_s` count the processor time of the process instead of wall time: what a machine gives that nobody else uses, and whose disk
-keeps up.
+Columns `/cpu_s` count the processor time of the process instead of wall time: what a machine gives that nobody else
+uses, and whose disk keeps up.
 
-Resident memory is split as the kernel does: `own` belongs to the process, `mapped` are pages of chunk files, which the kernel may drop.
+Resident memory is split as the kernel does: `own` belongs to the process, `mapped` are pages of chunk files, which the
+kernel may drop.
 """
 
 import argparse
@@ -23,8 +25,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.machine import command
-from train.machine import describe
-from train.replay import Replay
+from dreamer_spec.machine import describe
+from dreamer_spec.replay import Replay
 
 WORKERS, ROWS, LENGTH = 16, 16, 64
 KINDS = {
@@ -56,7 +58,11 @@ def latents(kind: str, rng: np.random.Generator, shape: tuple[int, ...]) -> dict
 def resident() -> dict[str, float]:
     """Resident memory in MiB."""
     lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
-    values = {name: int(text.split()[0]) / 1024 for name, _, text in (line.partition(":") for line in lines) if name.startswith("Rss")}
+    values = {
+        name: int(text.split()[0]) / 1024
+        for name, _, text in (line.partition(":") for line in lines)
+        if name.startswith("Rss")
+    }
     return {"own_mib": round(values["RssAnon"]), "mapped_mib": round(values["RssFile"])}
 
 
@@ -128,7 +134,17 @@ def timed(function: Any) -> float:
 def run_case(kind: str, filled: int, options: argparse.Namespace, limit: int) -> dict[str, Any]:
     """One case in a process of its own."""
     with tempfile.TemporaryDirectory(prefix="replay-", dir=options.directory) as directory:
-        call = [sys.executable, "-m", "benchmarks.replay", "--case", kind, "--records", str(filled), "--directory", directory]
+        call = [
+            sys.executable,
+            "-m",
+            "benchmarks.replay",
+            "--case",
+            kind,
+            "--records",
+            str(filled),
+            "--directory",
+            directory,
+        ]
         settings = ["--seconds", str(options.seconds), "--limits", str(limit >> 20)]
         result = subprocess.run([*call, *settings], capture_output=True, text=True, check=False)
     if result.returncode:
@@ -157,17 +173,23 @@ COLUMNS = (
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__.splitlines()[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
+    )
     parser.add_argument("--kinds", nargs="+", default=list(KINDS), choices=tuple(KINDS))
     parser.add_argument("--records", nargs="+", type=int, default=[10_000, 100_000], help="stored records")
     parser.add_argument("--limits", nargs="+", type=int, default=[2048], help="memory limits in MiB")
     parser.add_argument("--seconds", type=float, default=3.0, help="of each kind of measurement")
-    parser.add_argument("--directory", type=Path, default=None, help="where the files are; the system's temporary directory")
+    parser.add_argument(
+        "--directory", type=Path, default=None, help="where the files are; the system's temporary directory"
+    )
     parser.add_argument("--out", type=Path, default=None, help="JSON file for the results")
     parser.add_argument("--case", default=None, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.case:
-        case = measure(options.case, options.records[0], options.seconds, options.limits[0] << 20, options.directory / "replay")
+        case = measure(
+            options.case, options.records[0], options.seconds, options.limits[0] << 20, options.directory / "replay"
+        )
         print(json.dumps(case))
         return 0
     machine = describe()
@@ -179,11 +201,14 @@ def main() -> int:
             for filled in options.records:
                 results.append(run_case(kind, filled, options, limit << 20))
                 print(
-                    "".join(f"{results[-1].get(name, '-')!s:>{width}}" for name, width in COLUMNS), results[-1].get("error", ""), flush=True
+                    "".join(f"{results[-1].get(name, '-')!s:>{width}}" for name, width in COLUMNS),
+                    results[-1].get("error", ""),
+                    flush=True,
                 )
     if options.out:
         options.out.write_text(
-            json.dumps({"command": command("benchmarks.replay"), "machine": machine, "results": results}, indent=1) + "\n"
+            json.dumps({"command": command("benchmarks.replay"), "machine": machine, "results": results}, indent=1)
+            + "\n"
         )
     return 1 if any("error" in result for result in results) else 0
 

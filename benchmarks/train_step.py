@@ -1,7 +1,8 @@
 """Times one whole train step of each backend: `python -m benchmarks.train_step` (or `make bench`).
 
-Batch 16 x 64, horizon 15, six continuous actions, data in memory; the observation is a vector of 24 numbers or one 64 x 64 x 3 image. Every
-case runs in a process of its own, so that its peak memory is its own. Prints a table and with `--out` writes JSON.
+Batch 16 x 64, horizon 15, six continuous actions, data in memory; the observation is a vector of 24 numbers or one 64 x
+64 x 3 image. Every case runs in a process of its own, so that its peak memory is its own. Prints a table and with
+`--out` writes JSON.
 """
 
 import argparse
@@ -17,10 +18,10 @@ from typing import Any
 import numpy as np
 
 from benchmarks.machine import command, matrix_rate
+from dreamer_spec.backend import learner_class
+from dreamer_spec.machine import describe
+from dreamer_spec.threads import choose, spin_briefly
 from spec import Config, Image, Spaces, Vector, load_config
-from train.backend import learner_class
-from train.machine import describe
-from train.threads import choose, spin_briefly
 
 OBSERVATIONS = {"vector": {"vector": Vector(24)}, "image": {"image": Image(64, 64, 3)}}
 
@@ -31,7 +32,11 @@ def random_batch(rng: np.random.Generator, config: Config, spaces: Spaces) -> di
     batch: dict[str, np.ndarray] = {}
     for key, space in spaces.observations.items():
         shape = (B, T, *space.array_shape)
-        batch[key] = rng.integers(0, 256, shape).astype(np.uint8) if isinstance(space, Image) else rng.normal(size=shape).astype(np.float32)
+        batch[key] = (
+            rng.integers(0, 256, shape).astype(np.uint8)
+            if isinstance(space, Image)
+            else rng.normal(size=shape).astype(np.float32)
+        )
     return batch | {
         "reward": rng.normal(size=(B, T)).astype(np.float32),
         **{flag: np.zeros((B, T), bool) for flag in ("is_first", "is_last", "is_terminal")},
@@ -52,7 +57,8 @@ def measure(
     threads: int | None = None,
     **overrides: Any,
 ) -> dict[str, Any]:
-    """One case in this process: seconds from start to the end of the first step, median seconds of the others, peak memory."""
+    """One case in this process: seconds from start to the end of the first step, median seconds of the others, peak
+    memory."""
     start = time.perf_counter()
     config = load_config(profile, size, compute_dtype=dtype, **overrides)
     spaces = Spaces(OBSERVATIONS[observation], {"action": Vector(6)})
@@ -108,12 +114,16 @@ def run_case(arguments: list[str]) -> dict[str, Any]:
     command = [sys.executable, "-m", "benchmarks.train_step", "--case", *arguments]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     if result.returncode:
-        return {"error": result.stderr.strip().splitlines()[-1] if result.stderr.strip() else f"exit {result.returncode}"}
+        return {
+            "error": result.stderr.strip().splitlines()[-1] if result.stderr.strip() else f"exit {result.returncode}"
+        }
     return json.loads(result.stdout.splitlines()[-1])
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__.splitlines()[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
+    )
     parser.add_argument("--backends", nargs="+", default=["jax", "torch"])
     parser.add_argument("--sizes", nargs="+", default=["1m", "12m"])
     parser.add_argument("--observations", nargs="+", default=["vector", "image"], choices=tuple(OBSERVATIONS))
@@ -129,7 +139,14 @@ def main() -> int:
     options = parser.parse_args()
     batch = {"batch_size": options.batch_size, "batch_length": options.batch_length}
     if options.case:
-        case = (options.backends[0], options.sizes[0], options.observations[0], options.profile, options.dtypes[0], options.device)
+        case = (
+            options.backends[0],
+            options.sizes[0],
+            options.observations[0],
+            options.profile,
+            options.dtypes[0],
+            options.device,
+        )
         print(json.dumps(measure(*case, options.steps, options.threads, **batch)))
         return 0
     machine = describe() | {"numpy_gflops": round(matrix_rate(), 1)}
@@ -144,12 +161,17 @@ def main() -> int:
                     sizes = [f"--{key.replace('_', '-')}={value}" for key, value in batch.items()]
                     where = ["--device", options.device] if options.device else []
                     where += [f"--threads={options.threads}"] if options.threads else []
-                    result = run_case([*names, *sizes, *where, "--profile", options.profile, "--steps", str(options.steps)])
-                    results.append({"backend": backend, "size": size, "observation": observation, "dtype": dtype} | result)
+                    result = run_case(
+                        [*names, *sizes, *where, "--profile", options.profile, "--steps", str(options.steps)]
+                    )
+                    results.append(
+                        {"backend": backend, "size": size, "observation": observation, "dtype": dtype} | result
+                    )
                     print_row(results[-1])
     if options.out:
         options.out.write_text(
-            json.dumps({"command": command("benchmarks.train_step"), "machine": machine, "results": results}, indent=1) + "\n"
+            json.dumps({"command": command("benchmarks.train_step"), "machine": machine, "results": results}, indent=1)
+            + "\n"
         )
     return 1 if any("error" in result for result in results) else 0
 

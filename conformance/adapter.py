@@ -1,10 +1,11 @@
 """The adapter: how the kit reaches an implementation.
 
-An adapter is any object or module with some of the functions below, NumPy in and NumPy out. Every function is optional: what is missing
-is reported as not offered. Shapes and meanings are those of the reference function of the same name; the chapter of the row defines them.
-Parameters are the flat mapping of canonical names (spec/parameters.py), a state is the training state of [AGT], noise is an argument.
-Functions named `..._given` are the same without noise: they take the samples instead. Functions named `draw_...` sample with a generator
-of their own, made from a seed. How to write an adapter is in docs/adapters.md.
+An adapter is any object or module with some of the functions below, NumPy in and NumPy out. Every function is optional:
+what is missing is reported as not offered. Shapes and meanings are those of the reference function of the same name;
+the chapter of the row defines them. Parameters are the flat mapping of canonical names (spec/parameters.py), a state is
+the training state of [AGT], noise is an argument. Functions named `..._given` are the same without noise: they take the
+samples instead. Functions named `draw_...` sample with a generator of their own, made from a seed. How to write an
+adapter is in docs/adapters.md.
 """
 
 import importlib
@@ -112,7 +113,14 @@ class Adapter(Protocol):
     def prior(self, params: Arrays, deter: Array, config: Config) -> Array: ...
     def posterior(self, params: Arrays, deter: Array, tokens: Array, config: Config) -> Array: ...
     def observe(
-        self, params: Arrays, carry: Arrays, tokens: Array, prev_action: Array, is_first: Array, uniform: Array, config: Config
+        self,
+        params: Arrays,
+        carry: Arrays,
+        tokens: Array,
+        prev_action: Array,
+        is_first: Array,
+        uniform: Array,
+        config: Config,
     ) -> Arrays: ...
     def imagine(self, params: Arrays, carry: Arrays, action: Array, uniform: Array, config: Config) -> Arrays:
         """Imagination under given actions.
@@ -128,7 +136,14 @@ class Adapter(Protocol):
         """
 
     def observe_given(
-        self, params: Arrays, carry: Arrays, tokens: Array, prev_action: Array, is_first: Array, stoch: Array, config: Config
+        self,
+        params: Arrays,
+        carry: Arrays,
+        tokens: Array,
+        prev_action: Array,
+        is_first: Array,
+        stoch: Array,
+        config: Config,
     ) -> Arrays:
         """A sequence of observations with given latents: what `observe` computes, up to the logits.
 
@@ -166,7 +181,9 @@ class Adapter(Protocol):
     # world_model
     def continue_target(self, is_terminal: Array, config: Config) -> Array: ...
     def kl_losses(self, posterior_logits: Array, prior_logits: Array, config: Config) -> tuple[Array, Array]: ...
-    def reconstruction_losses(self, predictions: Arrays, observations: Arrays, spaces: Spaces, config: Config) -> Arrays: ...
+    def reconstruction_losses(
+        self, predictions: Arrays, observations: Arrays, spaces: Spaces, config: Config
+    ) -> Arrays: ...
     def open_loop(
         self,
         params: Arrays,
@@ -180,7 +197,9 @@ class Adapter(Protocol):
     ) -> Arrays: ...
 
     # returns
-    def lambda_return(self, reward: Array, continue_: Array, value: Array, discount: float, lambda_: float) -> Array: ...
+    def lambda_return(
+        self, reward: Array, continue_: Array, value: Array, discount: float, lambda_: float
+    ) -> Array: ...
     def replay_lambda_return(
         self, reward: Array, is_last: Array, is_terminal: Array, annotation: Array, discount: float, lambda_: float
     ) -> Array: ...
@@ -196,8 +215,12 @@ class Adapter(Protocol):
     def actor_loss(
         self, log_prob: Array, entropy: Array, returns: Array, value: Array, weight: Array, scale: Array, config: Config
     ) -> Array: ...
-    def critic_loss(self, logits: Array, slow_logits: Array, returns: Array, weight: Array, config: Config) -> Array: ...
-    def replay_critic_loss(self, logits: Array, slow_logits: Array, returns: Array, is_last: Array, config: Config) -> Array: ...
+    def critic_loss(
+        self, logits: Array, slow_logits: Array, returns: Array, weight: Array, config: Config
+    ) -> Array: ...
+    def replay_critic_loss(
+        self, logits: Array, slow_logits: Array, returns: Array, is_last: Array, config: Config
+    ) -> Array: ...
     def update_slow_critic(self, slow: Arrays, critic: Arrays, decay: float) -> Arrays: ...
     def draw_actions(self, outputs: Nested, spaces: Spaces, config: Config, seed: int, n: int) -> Array:
         """Independent samples of the policy at one state.
@@ -213,8 +236,12 @@ class Adapter(Protocol):
     # optimizer
     def adaptive_gradient_clip(self, gradient: Array, parameter: Array, clip: float, epsilon: float) -> Array: ...
     def learning_rate(self, step: int, config: Config) -> float: ...
-    def laprop(self, gradient: Array, second_moment: Array, momentum: Array, step: int, config: Config) -> tuple[Array, Array, Array]: ...
-    def optimizer_step(self, params: Arrays, gradients: Arrays, state: Nested, config: Config) -> tuple[Arrays, Nested]: ...
+    def laprop(
+        self, gradient: Array, second_moment: Array, momentum: Array, step: int, config: Config
+    ) -> tuple[Array, Array, Array]: ...
+    def optimizer_step(
+        self, params: Arrays, gradients: Arrays, state: Nested, config: Config
+    ) -> tuple[Arrays, Nested]: ...
 
     # agent
     def initial_parameters(self, table: Mapping[str, Parameter], uniforms: Arrays) -> Arrays: ...
@@ -238,7 +265,14 @@ class Adapter(Protocol):
         config: Config,
     ) -> tuple[Arrays, Array]: ...
     def losses(
-        self, params: Arrays, slow_critic: Arrays, return_range: Range, batch: Arrays, noise: Arrays, spaces: Spaces, config: Config
+        self,
+        params: Arrays,
+        slow_critic: Arrays,
+        return_range: Range,
+        batch: Arrays,
+        noise: Arrays,
+        spaces: Spaces,
+        config: Config,
     ) -> tuple[float, Nested]: ...
     def loss_derivatives(
         self,
@@ -251,17 +285,28 @@ class Adapter(Protocol):
         config: Config,
         directions: Sequence[Arrays],
     ) -> Arrays:
-        """Loss name -> [directions]: the derivative of each unweighted mean loss along each direction in parameter space.
+        """Loss name -> [directions]: the derivative of each unweighted mean loss along each direction in parameter
+        space.
 
-        A direction names the parameters that move; with automatic differentiation this is the inner product with the loss's gradient.
+        A direction names the parameters that move; with automatic differentiation this is the inner product with the
+        loss's gradient.
         """
 
     def gradients(
-        self, params: Arrays, slow_critic: Arrays, return_range: Range, batch: Arrays, noise: Arrays, spaces: Spaces, config: Config
+        self,
+        params: Arrays,
+        slow_critic: Arrays,
+        return_range: Range,
+        batch: Arrays,
+        noise: Arrays,
+        spaces: Spaces,
+        config: Config,
     ) -> Arrays:
         """d total / d params of `losses`, by name."""
 
-    def train_step(self, state: Nested, batch: Arrays, noise: Arrays, spaces: Spaces, config: Config) -> tuple[Nested, Nested]:
+    def train_step(
+        self, state: Nested, batch: Arrays, noise: Arrays, spaces: Spaces, config: Config
+    ) -> tuple[Nested, Nested]:
         """One whole training step with the candidate's own gradients: (new state, aux of `losses`)."""
 
     def train_step_with(
@@ -270,28 +315,45 @@ class Adapter(Protocol):
         """The same with given gradients, for implementations without automatic differentiation."""
 
     def losses_given(
-        self, params: Arrays, slow_critic: Arrays, return_range: Range, batch: Arrays, samples: Arrays, spaces: Spaces, config: Config
+        self,
+        params: Arrays,
+        slow_critic: Arrays,
+        return_range: Range,
+        batch: Arrays,
+        samples: Arrays,
+        spaces: Spaces,
+        config: Config,
     ) -> tuple[float, Nested]:
         """`losses` with given samples in place of the noise.
 
         Args:
           params, slow_critic, return_range, batch: as `losses` takes them.
-          samples: "posterior" [B, T, S, C] and "prior" [N, H, S, C], one-hot, and "action" [N, H, A], flat, with N = B*T. Gradients are
-            those of samples: straight through "posterior", none into the others.
+          samples: "posterior" [B, T, S, C] and "prior" [N, H, S, C], one-hot, and "action" [N, H, A], flat, with N =
+            B*T. Gradients are those of samples: straight through "posterior", none into the others.
 
         Returns:
           The total and the aux of `losses`.
         """
 
     def gradients_given(
-        self, params: Arrays, slow_critic: Arrays, return_range: Range, batch: Arrays, samples: Arrays, spaces: Spaces, config: Config
+        self,
+        params: Arrays,
+        slow_critic: Arrays,
+        return_range: Range,
+        batch: Arrays,
+        samples: Arrays,
+        spaces: Spaces,
+        config: Config,
     ) -> Arrays:
         """d total / d params of `losses_given`, by name."""
 
-    def train_step_given(self, state: Nested, batch: Arrays, samples: Arrays, spaces: Spaces, config: Config) -> tuple[Nested, Nested]:
+    def train_step_given(
+        self, state: Nested, batch: Arrays, samples: Arrays, spaces: Spaces, config: Config
+    ) -> tuple[Nested, Nested]:
         """`train_step` with given samples in place of the noise: see `losses_given`."""
 
-    # replay and training loop: shared by all backends. The classes have the constructors and methods of the reference's.
+    # replay and training loop: shared by all backends. The classes have the constructors and methods of the
+    # reference's.
     def Replay(self, capacity: int, length: int) -> Any: ...  # noqa: N802
     def ReplayRatio(self, replay_ratio: float, batch_steps: int) -> Any: ...  # noqa: N802
     def can_train(self, items: int, config: Config) -> bool: ...
@@ -310,7 +372,8 @@ class Hooks(Protocol):
         """Called once before all checks, with the precision to compute in: "float64", "float32" or "bfloat16"."""
 
     def edition(self) -> str | None:
-        """The edition that the implementation claims to be: "2023", "2024-04", "2024-12" or "paper"; None for no claim."""
+        """The edition that the implementation claims to be: "2023", "2024-04", "2024-12" or "paper"; None for no
+        claim."""
 
     def convert(self, array: Array) -> Any:
         """Called on every array before it is handed to a function: `convert = torch.as_tensor`."""
@@ -368,7 +431,8 @@ CONFIG_FIELDS: dict[str, tuple[str, ...]] = {
     "optimizer_step": ("agc_clip", "agc_epsilon", "learning_rate", "warmup_steps", *_LAPROP),
     "can_train": ("batch_size", "batch_length", "replay_capacity"),
 }
-"""Functions of one part -> what of the configuration their results depend on, but for sizes, which the shapes show too."""
+"""Functions of one part -> what of the configuration their results depend on, but for sizes, which the shapes show
+too."""
 
 COLUMNS = ("numpy", "jax", "torch")
 

@@ -51,7 +51,11 @@ class ModuleAdapter(ForeignAdapter):
     @property
     def names(self) -> list[str]:
         """The public functions that the module itself defines."""
-        own = [name for name, value in vars(self._module).items() if getattr(value, "__module__", None) == self._module.__name__]
+        own = [
+            name
+            for name, value in vars(self._module).items()
+            if getattr(value, "__module__", None) == self._module.__name__
+        ]
         return [name for name in own if not name.startswith("_")]
 
 
@@ -65,14 +69,17 @@ def _require_arguments(name: str, function: Any) -> None:
     try:
         signature.bind(*expected)
     except TypeError as error:
-        raise TypeError(f"{name} is called with ({', '.join(expected)}), in this order; yours takes {signature}") from error
+        raise TypeError(
+            f"{name} is called with ({', '.join(expected)}), in this order; yours takes {signature}"
+        ) from error
 
 
 def load_candidate(name: str, dtype: str, device: str | None = None) -> object:
     """The adapter of one of our columns, or a module or file of somebody's own. device: of our columns.
 
     Raises:
-      UserError: there is no such thing, or what it needs is not there. A mistake inside of somebody's module keeps its traceback.
+      UserError: there is no such thing, or what it needs is not there. A mistake inside of somebody's module keeps its
+        traceback.
     """
     if name in COLUMNS:
         try:
@@ -86,7 +93,9 @@ def load_candidate(name: str, dtype: str, device: str | None = None) -> object:
     try:
         return ModuleAdapter(_load_module(name), dtype)
     except SystemExit as error:
-        raise UserError(f'{name} calls sys.exit({error.code!r}) when it is loaded; guard it with: if __name__ == "__main__"') from error
+        raise UserError(
+            f'{name} calls sys.exit({error.code!r}) when it is loaded; guard it with: if __name__ == "__main__"'
+        ) from error
 
 
 def _load_module(name: str) -> ModuleType:
@@ -94,7 +103,9 @@ def _load_module(name: str) -> ModuleType:
         if not Path(name).is_file():
             raise UserError(f"no file {name}; `conformance new-adapter {name}` writes one to fill in")
         return load_file(Path(name))
-    unknown = UserError(f"no module named {name!r}; give one of {', '.join(COLUMNS)}, a module on PYTHONPATH, or a .py file")
+    unknown = UserError(
+        f"no module named {name!r}; give one of {', '.join(COLUMNS)}, a module on PYTHONPATH, or a .py file"
+    )
     if not all(part.isidentifier() for part in name.split(".")):
         raise unknown
     sys.path.insert(0, "")
@@ -107,7 +118,9 @@ def _load_module(name: str) -> ModuleType:
 
 
 @contextlib.contextmanager
-def candidate(name: str | None, command: str | None, dtype: str, device: str | None, timeout: float) -> Iterator[object]:
+def candidate(
+    name: str | None, command: str | None, dtype: str, device: str | None, timeout: float
+) -> Iterator[object]:
     """An adapter while it is needed: of `load_candidate`, or of the process that a command starts.
 
     Raises:
@@ -132,7 +145,13 @@ def remarks(adapter: object) -> list[str]:
         return []
     edition = adapter.edition()
     about = f"{adapter.name} {adapter.version}".strip() + (f" claims the edition {edition}" if edition else "")
-    return [about, *(f"{name} is not a function of the interface; is {close} meant?" for name, close in _near_misses(adapter.names))]
+    return [
+        about,
+        *(
+            f"{name} is not a function of the interface; is {close} meant?"
+            for name, close in _near_misses(adapter.names)
+        ),
+    ]
 
 
 def _near_misses(names: Iterable[str]) -> Iterator[tuple[str, str]]:

@@ -1,8 +1,9 @@
 """Checks, and what they are run with.
 
-A check is a function that takes a `Run`, computes what the reference says, and hands it to `run.expect` together with the name and the
-arguments of the candidate's function. It is written once and runs on any adapter. A check names the requirements that it covers and the
-functions that it needs; where the adapter does not offer one of these, the check is reported as not offered.
+A check is a function that takes a `Run`, computes what the reference says, and hands it to `run.expect` together with
+the name and the arguments of the candidate's function. It is written once and runs on any adapter. A check names the
+requirements that it covers and the functions that it needs; where the adapter does not offer one of these, the check is
+reported as not offered.
 """
 
 import dataclasses
@@ -17,7 +18,8 @@ import numpy as np
 DTYPES = ("float64", "float32", "bfloat16")
 EPSILON = {"float64": 2.0**-52, "float32": 2.0**-23, "bfloat16": 2.0**-7}
 SMALLEST_NORMAL = {"float64": 2.0**-1022, "float32": 2.0**-126, "bfloat16": 2.0**-126}
-# Rounding of one function, relative to the magnitude of what it sums. float64 is held to 1e-12; the others to multiples of their epsilon.
+# Rounding of one function, relative to the magnitude of what it sums. float64 is held to 1e-12; the others to multiples
+# of their epsilon.
 BOUND = {"float64": 1e-12, "float32": 64 * EPSILON["float32"], "bfloat16": 16 * EPSILON["bfloat16"]}
 HUGE, TINY = 1e9, 1e-30  # sizes between which a number is ordinary; the outermost bins are below
 SHRINKING = 2.0  # seconds in which hypothesis may look for a smaller case that deviates
@@ -61,7 +63,8 @@ class Deviation(AssertionError):
 
 
 class CandidateLost(BaseException):
-    """The candidate is gone in the middle of a check. Not an Exception: hypothesis would go on to search for a smaller case."""
+    """The candidate is gone in the middle of a check. Not an Exception: hypothesis would go on to search for a smaller
+    case."""
 
 
 @dataclasses.dataclass
@@ -77,9 +80,10 @@ class Worst:
 class Call:
     """A call of the candidate, and the comparison of what came of it that went wrong.
 
-    function and arguments: as the candidate was called; arrays that are not large are copies, so that a candidate that writes into them
-    hides nothing. got
-    and expected: the two arrays that disagree, None where no arrays were compared. index: of the worst element, None where shapes differ.
+    function and arguments: as the candidate was called; arrays that are not large are copies, so that a candidate that
+    writes into them hides nothing. got
+    and expected: the two arrays that disagree, None where no arrays were compared. index: of the worst element, None
+    where shapes differ.
     """
 
     function: str
@@ -92,10 +96,12 @@ class Call:
 class Run:
     """One check on one adapter.
 
-    dtype: precision of the candidate. profile: name of the profile that configurations are drawn from. seed and examples: of the drawn
-    cases. shrink: whether hypothesis makes a case that deviates smaller, which takes longer. stand_in: an adapter that answers in place of
-    the candidate where the input is extreme (`is_extreme`, or to be refused), so that a deviation is one with ordinary input; None
-    for nobody. `compared` counts numbers compared, so that a check that compares nothing can be told from one that passes.
+    dtype: precision of the candidate. profile: name of the profile that configurations are drawn from. seed and
+    examples: of the drawn
+    cases. shrink: whether hypothesis makes a case that deviates smaller, which takes longer. stand_in: an adapter that
+    answers in place of the candidate where the input is extreme (`is_extreme`, or to be refused), so that a deviation
+    is one with ordinary input; None for nobody. `compared` counts numbers compared, so that a check that compares
+    nothing can be told from one that passes.
     """
 
     def __init__(
@@ -117,7 +123,9 @@ class Run:
         self.stand_in = stand_in
         self.worst = Worst()
         self.compared = 0
-        self.last_call: Call | None = None  # of the candidate; after a deviation, that of the smallest case that deviates
+        self.last_call: Call | None = (
+            None  # of the candidate; after a deviation, that of the smallest case that deviates
+        )
 
     @property
     def u(self) -> float:
@@ -133,7 +141,8 @@ class Run:
         return np.random.default_rng(self.seed)
 
     def cast(self, x: Any) -> np.ndarray:
-        """Rounds inputs to what the candidate's dtype can hold, so that reference and candidate start from the same numbers."""
+        """Rounds inputs to what the candidate's dtype can hold, so that reference and candidate start from the same
+        numbers."""
         return round_to(x, self.dtype)
 
     def call(self, function: str, *args: Any) -> Any:
@@ -152,12 +161,21 @@ class Run:
         return actual
 
     def compare(
-        self, where: str, actual: Any, expected: Any, *, magnitude: Any = None, factor: float = 1.0, bound: float | None = None
+        self,
+        where: str,
+        actual: Any,
+        expected: Any,
+        *,
+        magnitude: Any = None,
+        factor: float = 1.0,
+        bound: float | None = None,
     ) -> None:
-        """Raises `Deviation` unless |actual - expected| <= bound * magnitude, elementwise, in every array of a nested result.
+        """Raises `Deviation` unless |actual - expected| <= bound * magnitude, elementwise, in every array of a nested
+        result.
 
-        magnitude: what rounding is relative to. None: |expected| of each element; "tensor": the largest |expected| of the array; or an
-        array (for sums: the sum of the magnitudes of the terms). factor: multiplies the bound of the dtype, for longer computations.
+        magnitude: what rounding is relative to. None: |expected| of each element; "tensor": the largest |expected| of
+        the array; or an array (for sums: the sum of the magnitudes of the terms). factor: multiplies the bound of the
+        dtype, for longer computations.
         bound: replaces it. NaN must meet NaN and an infinity the same infinity.
         """
         if isinstance(expected, Mapping):
@@ -174,7 +192,9 @@ class Run:
                 part = magnitude[index] if isinstance(magnitude, tuple) else magnitude
                 self.compare(f"{where}[{index}]", a, e, magnitude=part, factor=factor, bound=bound)
         else:
-            self._compare_arrays(where, actual, expected, magnitude, BOUND[self.dtype] * factor if bound is None else bound)
+            self._compare_arrays(
+                where, actual, expected, magnitude, BOUND[self.dtype] * factor if bound is None else bound
+            )
 
     def exact(self, where: str, actual: Any, expected: Any) -> None:
         """Raises `Deviation` unless equal in every bit but the sign of zero."""
@@ -188,7 +208,8 @@ class Run:
             raise Deviation(f"{where} does not hold")
 
     def refuses(self, function: str, *args: Any, naming: Iterable[str] = ()) -> None:
-        """Raises `Deviation` unless the candidate raises a ValueError with a message; `naming` are words that it must hold.
+        """Raises `Deviation` unless the candidate raises a ValueError with a message; `naming` are words that it must
+        hold.
 
         Somebody else's program, an adapter that `refuses_anyhow`, may raise any exception.
         """
@@ -255,7 +276,11 @@ class Run:
         if share > 1:
             self._note(actual, expected, index)
             got, wanted = float(actual[index]), float(expected[index])
-            difference = f", differs by {abs(got - wanted):.3g}, allowed {bound * scale[index]:.3g}" if math.isfinite(got - wanted) else ""
+            difference = (
+                f", differs by {abs(got - wanted):.3g}, allowed {bound * scale[index]:.3g}"
+                if math.isfinite(got - wanted)
+                else ""
+            )
             raise Deviation(f"{place}: got {got!r}, expected {wanted!r}{difference}")
 
     def _note(self, got: np.ndarray, expected: np.ndarray, index: tuple[int, ...] | None) -> None:

@@ -13,14 +13,19 @@ from conformance.output import never_fail
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Returns 0 when everything that was asked holds, 1 when it does not, 2 for a wrong command line, 130 after Ctrl-C."""
+    """Returns 0 when everything that was asked holds, 1 when it does not, 2 for a wrong command line, 130 after
+    Ctrl-C."""
     never_fail()
-    parser = argparse.ArgumentParser(prog="conformance", description="Checks an implementation of DreamerV3 against the specification.")
+    parser = argparse.ArgumentParser(
+        prog="conformance", description="Checks an implementation of DreamerV3 against the specification."
+    )
     commands = parser.add_subparsers(dest="command", required=True)
     modules = {name.replace("_", "-"): importlib.import_module(f"conformance.commands.{name}") for name in COMMANDS}
     for name, module in modules.items():
         help_line = str(module.__doc__).splitlines()[0]
-        command = commands.add_parser(name, help=help_line, description=help_line, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+        command = commands.add_parser(
+            name, help=help_line, description=help_line, formatter_class=argparse.ArgumentDefaultsHelpFormatter
+        )
         module.add_arguments(command)
     options = parser.parse_args(arguments)
     console = Console(width=None if sys.stdout.isatty() else 150)

@@ -8,19 +8,21 @@ from conformance.check import CHECKS
 from conformance.execute import missing, selected_checks
 from conformance.requirements import requirements
 
-# Replay and the training loop are rows that belong to no backend. Of the reference's functions the trainer uses `Replay`, `ReplayRatio`,
-# `can_train` and `derive_seed`; what it says itself is covered by the tests.
+# Replay and the training loop are rows that belong to no backend. Of the reference's functions the trainer uses
+# `Replay`, `ReplayRatio`, `can_train` and `derive_seed`; what it says itself is covered by the tests.
 SHARED_ROWS = ("REP", "LOOP")
 OURS = ("conformance", "impl_jax", "impl_torch", "reference_numpy", "spec")
 TESTS = Path(__file__).resolve().parent.parent / "tests"
 
 
 def coverage() -> tuple[dict[str, dict[str, list[str]]], list[str]]:
-    """Requirement -> column -> names of the checks that cover it there, and what is wrong: uncovered requirements and unknown ids.
+    """Requirement -> column -> names of the checks that cover it there, and what is wrong: uncovered requirements and
+    unknown ids.
 
-    The column `tests` holds tests marked with `pytest.mark.covers`: what a whole trainer or learner shows, and no adapter can. Such a
-    requirement needs no check. A backend that is not installed has no column. An installed package comes without tests: then `tests` is no
-    column either, and a requirement without a check is not wrong, as nobody can tell whether a test covers it.
+    The column `tests` holds tests marked with `pytest.mark.covers`: what a whole trainer or learner shows, and no
+    adapter can. Such a requirement needs no check. A backend that is not installed has no column. An installed package
+    comes without tests: then `tests` is no column either, and a requirement without a check is not wrong, as nobody can
+    tell whether a test covers it.
     """
     selected_checks("float64")
     adapters = installed_adapters()
@@ -30,15 +32,29 @@ def coverage() -> tuple[dict[str, dict[str, list[str]]], list[str]]:
     for requirement in requirements():
         columns = [column for column in adapters if column == "numpy" or requirement.split("-")[0] not in SHARED_ROWS]
         checks = {
-            column: [check.name for check in CHECKS.values() if requirement in check.requirements and not missing(adapters[column], check)]
+            column: [
+                check.name
+                for check in CHECKS.values()
+                if requirement in check.requirements and not missing(adapters[column], check)
+            ]
             for column in columns
         }
         table[requirement] = {**checks, **({"tests": tests.get(requirement, [])} if tests else {})}
         if tests and requirement not in tests:
-            problems += [f"{requirement}: no check covers it on {column}, and no test" for column, names in checks.items() if not names]
+            problems += [
+                f"{requirement}: no check covers it on {column}, and no test"
+                for column, names in checks.items()
+                if not names
+            ]
     for check in CHECKS.values():
-        problems += [f"{check.name} names {name}, which no chapter has" for name in check.requirements if name not in requirements()]
-    problems += [f"{', '.join(tests[name])} names {name}, which no chapter has" for name in tests if name not in requirements()]
+        problems += [
+            f"{check.name} names {name}, which no chapter has"
+            for name in check.requirements
+            if name not in requirements()
+        ]
+    problems += [
+        f"{', '.join(tests[name])} names {name}, which no chapter has" for name in tests if name not in requirements()
+    ]
     return table, problems
 
 
@@ -55,7 +71,8 @@ def installed_adapters() -> dict[str, object]:
 
 
 def covering_tests(folder: Path = TESTS) -> dict[str, list[str]]:
-    """Requirement -> tests marked `@pytest.mark.covers("LOOP-1", ...)`, read from their source: the tests are not run, nor imported.
+    """Requirement -> tests marked `@pytest.mark.covers("LOOP-1", ...)`, read from their source: the tests are not run,
+    nor imported.
 
     Empty where there is no such folder: an installed package comes without tests.
 
@@ -72,8 +89,16 @@ def covering_tests(folder: Path = TESTS) -> dict[str, list[str]]:
 
 
 def _marked(function: ast.FunctionDef, path: Path) -> list[str]:
-    marks = [mark for mark in function.decorator_list if isinstance(mark, ast.Call) and ast.unparse(mark.func) == "pytest.mark.covers"]
-    identifiers = [argument.value if isinstance(argument, ast.Constant) else None for mark in marks for argument in mark.args]
-    if any(mark.keywords or not mark.args for mark in marks) or not all(isinstance(identifier, str) for identifier in identifiers):
+    marks = [
+        mark
+        for mark in function.decorator_list
+        if isinstance(mark, ast.Call) and ast.unparse(mark.func) == "pytest.mark.covers"
+    ]
+    identifiers = [
+        argument.value if isinstance(argument, ast.Constant) else None for mark in marks for argument in mark.args
+    ]
+    if any(mark.keywords or not mark.args for mark in marks) or not all(
+        isinstance(identifier, str) for identifier in identifiers
+    ):
         raise ValueError(f"{path.name}:{function.lineno}: pytest.mark.covers takes requirement ids, written out")
     return [str(identifier) for identifier in identifiers]

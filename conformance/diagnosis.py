@@ -1,9 +1,10 @@
 """From deviations to the mistake: which mutant gives the numbers of the candidate where the checks fail.
 
-A failing check is run again on the candidate with a note of every call and its result: its trace. The same check is run on each mutant
-that it reaches. A mutant explains the check if its results agree with the trace, also where those of the reference do not. Where a
-check fails with ordinary input, the trace is made of that alone: what is done with NaN and infinities would hide the mistake. Of
-mutants that explain the same, those are named that also agree after the first deviation.
+A failing check is run again on the candidate with a note of every call and its result: its trace. The same check is run
+on each mutant that it reaches. A mutant explains the check if its results agree with the trace, also where those of the
+reference do not. Where a check fails with ordinary input, the trace is made of that alone: what is done with NaN and
+infinities would hide the mistake. Of mutants that explain the same, those are named that also agree after the first
+deviation.
 """
 
 import copy
@@ -19,11 +20,13 @@ from conformance.execute import Result, finish, missing
 from conformance.mutants import MUTANTS, Mutant, MutantAdapter
 from conformance.mutants.trial import on_the_mutant, on_the_reference
 
-# Agreement with a trace, relative to the largest number of an array, where the check itself does not say what it allows.
+# Agreement with a trace, relative to the largest number of an array, where the check itself does not say what it
+# allows.
 AGREEMENT = {"float64": 1e-9, "float32": 1e-3, "bfloat16": 0.1}
 DERIVATIVES = {"float64": 1e-5, "float32": 1e-2, "bfloat16": 0.1}  # those of the reference are differences
 TRACE_LENGTH = 5000
-TRIES = 8  # so many checks, the most elementary first, are compared with every mutant in vain before the rest is left unexplained
+# so many checks, the most elementary first, are compared with every mutant in vain before the rest is left unexplained
+TRIES = 8
 VALUES = "agent.losses_match"
 
 
@@ -31,7 +34,8 @@ VALUES = "agent.losses_match"
 class Diagnosis:
     """The candidate behaves like a mutant.
 
-    explained: names of the failing checks in which its results are those of the mutant. unexplained: of the other failing checks that
+    explained: names of the failing checks in which its results are those of the mutant. unexplained: of the other
+    failing checks that
     can be compared. alternatives: mutants that explain the same checks and cannot be told apart by any other.
     """
 
@@ -55,15 +59,20 @@ class Diagnosis:
         }
 
 
-def diagnose(adapter: object, results: Iterable[Result], dtype: str, profile: str, seed: int = 0, examples: int = 25) -> list[Diagnosis]:
-    """The mistakes that explain why checks fail, those that explain most first; each explains a check that none before it does.
+def diagnose(
+    adapter: object, results: Iterable[Result], dtype: str, profile: str, seed: int = 0, examples: int = 25
+) -> list[Diagnosis]:
+    """The mistakes that explain why checks fail, those that explain most first; each explains a check that none before
+    it does.
 
     Args:
       adapter: the candidate.
       results: of all checks that were run on it, with the settings that follow.
     """
     results = list(results)
-    candidate = _Candidate(adapter, (dtype, profile, seed, examples), {result.check.name: result.status for result in results})
+    candidate = _Candidate(
+        adapter, (dtype, profile, seed, examples), {result.check.name: result.status for result in results}
+    )
     failing = [result.check for result in results if result.status in ("fail", "error")]
     failing.sort(key=lambda check: (check.level, _of_derivatives(check), candidate.size(check), check.name))
     traces = {check: trace for check in failing if (trace := candidate.trace(check))}
@@ -100,12 +109,15 @@ def _suspects(candidate: "_Candidate", evidence: dict[Check, "_Trace"]) -> list[
 
 
 def _best(candidate: "_Candidate", explained: dict[Mutant, set[Check]], passing: list[Check]) -> list[Mutant]:
-    """The mutants that explain most checks; of several, those that no passing check speaks against, if there are such."""
+    """The mutants that explain most checks; of several, those that no passing check speaks against, if there are
+    such."""
     most = max(map(len, explained.values()))
     tied = [mutant for mutant, checks in explained.items() if len(checks) == most]
     if len(tied) == 1:
         return tied
-    tied = [mutant for mutant in tied if all(candidate.follows_to_the_end(mutant, check) for check in explained[mutant])] or tied
+    tied = [
+        mutant for mutant in tied if all(candidate.follows_to_the_end(mutant, check) for check in explained[mutant])
+    ] or tied
     return [mutant for mutant in tied if not candidate.contradicts(mutant, passing)] or tied
 
 
@@ -121,7 +133,8 @@ class _Call:
 
 @dataclasses.dataclass
 class _Trace:
-    """The calls of a check. ordinary: with extreme input they are the reference's. to_the_end: also those after the first deviation."""
+    """The calls of a check. ordinary: with extreme input they are the reference's. to_the_end: also those after the
+    first deviation."""
 
     ordinary: bool
     to_the_end: bool = False
@@ -145,7 +158,9 @@ class _Candidate:
 
         Derivatives are compared where the losses are right: those of other losses are wrong anyway.
         """
-        if missing(NumpyAdapter(), check) or (_of_derivatives(check) and self.statuses.get(VALUES) in ("fail", "error")):
+        if missing(NumpyAdapter(), check) or (
+            _of_derivatives(check) and self.statuses.get(VALUES) in ("fail", "error")
+        ):
             return None
         for ordinary in (True, False):
             run = _Recorder(self.adapter, *self.settings, _Trace(ordinary))
@@ -157,13 +172,18 @@ class _Candidate:
     def explains(self, mutant: Mutant, check: Check, trace: _Trace) -> bool:
         key = (mutant.name, check.name)
         if key not in self._explained:
-            self._explained[key] = self._may_explain(mutant, check) and self._follows(MutantAdapter(mutant), check, trace)
+            self._explained[key] = self._may_explain(mutant, check) and self._follows(
+                MutantAdapter(mutant), check, trace
+            )
         return self._explained[key]
 
     def contradicts(self, mutant: Mutant, passing: list[Check]) -> bool:
         """Whether a check that the candidate passes fails on the mutant."""
         rows = {target.partition(".")[0] for target in mutant.edits}
-        return any(self._fails(mutant, check) for check in sorted(passing, key=lambda check: check.name.partition(".")[0] not in rows))
+        return any(
+            self._fails(mutant, check)
+            for check in sorted(passing, key=lambda check: check.name.partition(".")[0] not in rows)
+        )
 
     def follows_to_the_end(self, mutant: Mutant, check: Check) -> bool:
         if check.name not in self._whole:
@@ -173,7 +193,8 @@ class _Candidate:
         return self._follows(MutantAdapter(mutant), check, self._whole[check.name])
 
     def _may_explain(self, mutant: Mutant, check: Check) -> bool:
-        """What changes a loss is not the mistake of a candidate whose losses are right. This is said fast, derivatives are slow."""
+        """What changes a loss is not the mistake of a candidate whose losses are right. This is said fast, derivatives
+        are slow."""
         right = _of_derivatives(check) and self.statuses.get(VALUES) == "pass"
         return self._reaches(mutant, check) and not (right and self._fails(mutant, CHECKS[VALUES]))
 
@@ -193,7 +214,9 @@ class _Recorder(Run):
     """A run that notes every call, those of objects that the candidate makes included."""
 
     def __init__(self, adapter: object, dtype: str, profile: str, seed: int, examples: int, trace: _Trace) -> None:
-        super().__init__(adapter, dtype, profile, seed, examples, shrink=False, stand_in=NumpyAdapter() if trace.ordinary else None)
+        super().__init__(
+            adapter, dtype, profile, seed, examples, shrink=False, stand_in=NumpyAdapter() if trace.ordinary else None
+        )
         self.trace = trace
 
     @property
@@ -313,17 +336,22 @@ def _is_data(result: Any) -> bool:
 
 
 def _agree(ruler: Run, result: Any, noted: Any, bound: float) -> bool:
-    """Whether a result has the numbers of the noted one within the bound, and is equal otherwise. The noted one may hold more keys."""
+    """Whether a result has the numbers of the noted one within the bound, and is equal otherwise. The noted one may
+    hold more keys."""
     if isinstance(result, Mapping):
         if not set(result) <= set(noted):
             return False
-        if all(isinstance(value, int | float | np.number | np.ndarray) and np.ndim(value) == 0 for value in result.values()):
+        if all(
+            isinstance(value, int | float | np.number | np.ndarray) and np.ndim(value) == 0 for value in result.values()
+        ):
             # Numbers under one roof, such as losses: the large ones say how exact the small ones can be.
             result, noted = np.array([*result.values()]), np.array([noted[key] for key in result])
         else:
             return all(_agree(ruler, result[key], noted[key], bound) for key in result)
     if isinstance(result, tuple | list):
-        return len(result) == len(noted) and all(_agree(ruler, *pair, bound) for pair in zip(result, noted, strict=True))
+        return len(result) == len(noted) and all(
+            _agree(ruler, *pair, bound) for pair in zip(result, noted, strict=True)
+        )
     if result is None or isinstance(result, str):
         return bool(result == noted)
     ruler.compare("", result, noted, magnitude="tensor", bound=bound)

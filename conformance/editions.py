@@ -1,9 +1,10 @@
 """How a candidate is judged in an edition, and which edition fits it best.
 
-The checks say what holds in the chapters. Where an edition differs, a mutant of the reference may behave as the edition does; the
-reference with all mutants of an edition is the edition's own reference. A check that it passes holds in the edition, too, and runs as
-always. A check that it does not pass, or that names what the edition has otherwise, gives the calls: what the candidate returns is
-compared with what the edition's reference returns. And where the edition's way is not modelled, nothing is judged.
+The checks say what holds in the chapters. Where an edition differs, a mutant of the reference may behave as the edition
+does; the reference with all mutants of an edition is the edition's own reference. A check that it passes holds in the
+edition, too, and runs as always. A check that it does not pass, or that names what the edition has otherwise, gives the
+calls: what the candidate returns is compared with what the edition's reference returns. And where the edition's way is
+not modelled, nothing is judged.
 """
 
 import dataclasses
@@ -52,11 +53,17 @@ def own_reference(edition: str) -> Mutant | None:
 
 
 def telling_checks(checks: Iterable[Check]) -> list[Check]:
-    """Those by which editions can be told apart: of a requirement that an edition has otherwise, by a mutant or by a setting.
+    """Those by which editions can be told apart: of a requirement that an edition has otherwise, by a mutant or by a
+    setting.
 
     Gradients are left out: they are slow, and tell nothing that the losses do not.
     """
-    told = {name for edition in editions().values() for name, difference in edition.differs.items() if difference.is_modelled}
+    told = {
+        name
+        for edition in editions().values()
+        for name, difference in edition.differs.items()
+        if difference.is_modelled
+    }
     return [check for check in checks if not told.isdisjoint(check.requirements) and GRADIENTS.isdisjoint(check.uses)]
 
 
@@ -79,11 +86,15 @@ def judge(
     if reason := _unknown(check, edition.name, dtype, seed, examples):
         return Result(check, NOT_JUDGED, Worst(), 0, reason)
     if _holds(check, edition.name, dtype, seed, examples):
-        return finish(check, Run(adapter, dtype, edition.profile, seed, examples, shrink, NumpyAdapter() if ordinary else None))
+        return finish(
+            check, Run(adapter, dtype, edition.profile, seed, examples, shrink, NumpyAdapter() if ordinary else None)
+        )
     return finish(check, _ComparedRun(adapter, edition, dtype, seed, examples, shrink, ordinary))
 
 
-def judge_twice(check: Check, adapter: object, edition: Edition, dtype: str, seed: int = 0, examples: int = 25) -> Result:
+def judge_twice(
+    check: Check, adapter: object, edition: Edition, dtype: str, seed: int = 0, examples: int = 25
+) -> Result:
     """`judge`; where the check fails, it is run again to see whether it fails with ordinary input, too."""
     result = judge(check, adapter, edition, dtype, seed, examples)
     if result.status not in FAILING:
@@ -120,7 +131,8 @@ def _is_unknown(edition: Edition, requirement: str) -> bool:
 
 @functools.cache
 def _holds(check: Check, name: str, dtype: str, seed: int, examples: int) -> bool:
-    """Whether a check is run as always: it names nothing that the edition has otherwise, and the edition's own reference passes it."""
+    """Whether a check is run as always: it names nothing that the edition has otherwise, and the edition's own
+    reference passes it."""
     differs, mutant = editions()[name].differs, own_reference(name)
     if any(requirement in differs and differs[requirement].like for requirement in check.requirements):
         return False
@@ -136,16 +148,20 @@ def _reach(check: Check, name: str, dtype: str, seed: int) -> frozenset[str]:
 
 
 def _stand_in(check: Check, dtype: str) -> tuple[Check, str]:
-    """What can be asked of the reference: for gradients and train steps, which it lacks, the losses that these are made of."""
+    """What can be asked of the reference: for gradients and train steps, which it lacks, the losses that these are made
+    of."""
     if not missing(NumpyAdapter(), check):
         return check, dtype
     return CHECKS[VALUES], dtype if dtype in CHECKS[VALUES].dtypes else "float64"
 
 
 class _ComparedRun(Run):
-    """A check of whose calls every one is compared with the edition's reference. What the check itself expects does not count."""
+    """A check of whose calls every one is compared with the edition's reference. What the check itself expects does not
+    count."""
 
-    def __init__(self, adapter: object, edition: Edition, dtype: str, seed: int, examples: int, shrink: bool, ordinary: bool) -> None:
+    def __init__(
+        self, adapter: object, edition: Edition, dtype: str, seed: int, examples: int, shrink: bool, ordinary: bool
+    ) -> None:
         mutant = own_reference(edition.name)
         assert mutant is not None
         self._right = MutantAdapter(mutant)
@@ -158,7 +174,12 @@ class _ComparedRun(Run):
         expected = getattr(self._right, function)(*args)
         with self._counting():
             actual = self.call(function, *args)
-            self.compare(function, actual, expected, bound=(DERIVATIVES if function == "loss_derivatives" else AGREEMENT)[self.dtype])
+            self.compare(
+                function,
+                actual,
+                expected,
+                bound=(DERIVATIVES if function == "loss_derivatives" else AGREEMENT)[self.dtype],
+            )
         return actual
 
     def expect(self, function: str, args: tuple[Any, ...], expected: Any, **how: Any) -> Any:
@@ -186,9 +207,13 @@ class _ComparedRun(Run):
             super().holds(where, condition)
 
     def _compare_arrays(self, where: str, actual: Any, expected: Any, magnitude: Any, bound: float) -> None:
-        expected = round_to(expected, "float64" if self.dtype == "float64" else "float32")  # beyond which a right result is infinite
+        expected = round_to(
+            expected, "float64" if self.dtype == "float64" else "float32"
+        )  # beyond which a right result is infinite
         # Digits far below 1 are demanded by the chapters. An edition may lose them, each program in its own way.
-        super()._compare_arrays(where, actual, expected, np.maximum(np.abs(expected), 1.0) if magnitude is None else magnitude, bound)
+        super()._compare_arrays(
+            where, actual, expected, np.maximum(np.abs(expected), 1.0) if magnitude is None else magnitude, bound
+        )
 
     @contextmanager
     def _counting(self) -> Iterator[None]:
@@ -218,7 +243,8 @@ class Fit:
 def fit(checks: Iterable[Check], adapter: object, dtype: str, seed: int = 0, examples: int = FIT_EXAMPLES) -> list[Fit]:
     """How the candidate does in each edition with ordinary input, those that are preferred first.
 
-    A candidate that raises in one edition is not asked again in the others: it would tell nothing, and may be slow to come back.
+    A candidate that raises in one edition is not asked again in the others: it would tell nothing, and may be slow to
+    come back.
     """
     found: dict[str, dict[str, str]] = {name: {} for name in PREFERRED}
     for check in checks:
@@ -228,7 +254,10 @@ def fit(checks: Iterable[Check], adapter: object, dtype: str, seed: int = 0, exa
         for name, statuses in found.items():
             known = _unknown(check, name, dtype, seed, examples)
             status = NOT_JUDGED if known else "error" if broken else ""
-            status = status or judge(check, adapter, editions()[name], dtype, seed, examples, shrink=False, ordinary=True).status
+            status = (
+                status
+                or judge(check, adapter, editions()[name], dtype, seed, examples, shrink=False, ordinary=True).status
+            )
             statuses[check.name] = NOT_JUDGED if status == "not offered" else status
             broken |= status == "error"
     return [Fit(name, statuses) for name, statuses in found.items()]
@@ -237,7 +266,8 @@ def fit(checks: Iterable[Check], adapter: object, dtype: str, seed: int = 0, exa
 def best(fits: Iterable[Fit]) -> Fit:
     """The edition that the fewest others fit better; of several, the first.
 
-    Two editions are compared on the checks that are judged in both. So an edition does not win by what is not judged in it.
+    Two editions are compared on the checks that are judged in both. So an edition does not win by what is not judged in
+    it.
     """
     fits = list(fits)
     return min(fits, key=lambda one: sum(fits_better(other, one) for other in fits))
@@ -263,7 +293,8 @@ def to_json(fits: list[Fit], edition: str) -> dict[str, Any]:
     better = best(fits)
     return {
         "editions": [
-            {"edition": one.edition, "passed": len(one.passed), "judged": len(one.judged), "offered": len(one.statuses)} for one in fits
+            {"edition": one.edition, "passed": len(one.passed), "judged": len(one.judged), "offered": len(one.statuses)}
+            for one in fits
         ],
         "alike": alike(fits, chosen),
         "better": better.edition if fits_better(better, chosen) else None,

@@ -5,7 +5,8 @@ from pathlib import Path
 
 
 class UserError(Exception):
-    """Something that the user can mend. The message names the thing and the remedy; the command prints it in one line, exit code 2."""
+    """Something that the user can mend. The message names the thing and the remedy; the command prints it in one line,
+    exit code 2."""
 
 
 def read_text(path: Path) -> str:

@@ -17,10 +17,11 @@ NOT_IMPLEMENTED = "not implemented: "
 
 @dataclasses.dataclass(frozen=True)
 class Result:
-    """What one check found. status: "pass", "fail", "error" (the candidate raised), "not offered" or "not in edition" (not judged).
+    """What one check found. status: "pass", "fail", "error" (the candidate raised), "not offered" or "not in edition"
+    (not judged).
 
-    call: where it failed, the last call of the candidate; None where it was not called. extreme: whether it fails with extreme input
-    only, and passes with ordinary input.
+    call: where it failed, the last call of the candidate; None where it was not called. extreme: whether it fails with
+    extreme input only, and passes with ordinary input.
     """
 
     check: Check
@@ -34,7 +35,8 @@ class Result:
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """What a run was asked to do. candidate: its name, or the command of a process. at_least: how many checks must pass."""
+    """What a run was asked to do. candidate: its name, or the command of a process. at_least: how many checks must
+    pass."""
 
     candidate: str
     process: bool
@@ -73,7 +75,8 @@ class Row:
 
 
 def missing(adapter: object, check: Check) -> list[str]:
-    """What the check needs and the adapter does not offer. A module may hold other things under such names: `from mine import losses`."""
+    """What the check needs and the adapter does not offer. A module may hold other things under such names: `from mine
+    import losses`."""
     return [name for name in check.uses if not callable(getattr(adapter, name, None))]
 
 
@@ -86,7 +89,9 @@ def not_implemented(check: Check, function: str, reason: str) -> Result:
     return Result(check, "not offered", Worst(), 0, f"{NOT_IMPLEMENTED}{function}" + (f" ({reason})" if reason else ""))
 
 
-def run_check(check: Check, adapter: object, dtype: str, profile: str, seed: int = 0, examples: int = 25, shrink: bool = True) -> Result:
+def run_check(
+    check: Check, adapter: object, dtype: str, profile: str, seed: int = 0, examples: int = 25, shrink: bool = True
+) -> Result:
     """Runs one check; what the candidate raises becomes a result."""
     if lacking := missing(adapter, check):
         return not_offered(check, lacking)
@@ -103,9 +108,18 @@ def finish(check: Check, run: Run) -> Result:
     except CandidateLost as lost:
         return Result(check, "error", Worst(math.inf, math.inf, check.name), run.compared, str(lost), run.last_call)
     except (Exception, SystemExit) as error:  # an object that the candidate made may call sys.exit
-        if isinstance(error, NotImplementedError) and getattr(run.adapter, "refuses_anyhow", False):  # not of our own columns
+        if isinstance(error, NotImplementedError) and getattr(
+            run.adapter, "refuses_anyhow", False
+        ):  # not of our own columns
             return not_implemented(check, run.last_call.function if run.last_call else check.name, str(error))
-        return Result(check, "error", Worst(math.inf, math.inf, check.name), run.compared, traceback.format_exc(limit=-4), run.last_call)
+        return Result(
+            check,
+            "error",
+            Worst(math.inf, math.inf, check.name),
+            run.compared,
+            traceback.format_exc(limit=-4),
+            run.last_call,
+        )
     if not run.compared:
         return Result(check, "error", run.worst, 0, "the check compared nothing")
     return Result(check, "pass", run.worst, run.compared)
@@ -118,19 +132,24 @@ def selected_checks(dtype: str, only: str = "") -> list[Check]:
     return [
         check
         for check in sorted(CHECKS.values(), key=lambda check: (check.level, check.name))
-        if dtype in check.dtypes and (only in check.name or any(only in requirement for requirement in check.requirements))
+        if dtype in check.dtypes
+        and (only in check.name or any(only in requirement for requirement in check.requirements))
     ]
 
 
-def run_checks(adapter: object, dtype: str, profile: str, seed: int = 0, examples: int = 25, only: str = "") -> Iterable[Result]:
+def run_checks(
+    adapter: object, dtype: str, profile: str, seed: int = 0, examples: int = 25, only: str = ""
+) -> Iterable[Result]:
     for check in selected_checks(dtype, only):
         yield run_check(check, adapter, dtype, profile, seed, examples)
 
 
 def rows(results: Iterable[Result]) -> list[Row]:
-    """The results by requirement, in the order of the chapters; requirements that none of the checks names are left out."""
+    """The results by requirement, in the order of the chapters; requirements that none of the checks names are left
+    out."""
     results = list(results)
     found = [
-        Row(requirement, tuple(result for result in results if requirement in result.check.requirements)) for requirement in requirements()
+        Row(requirement, tuple(result for result in results if requirement in result.check.requirements))
+        for requirement in requirements()
     ]
     return [row for row in found if row.results]

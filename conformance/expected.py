@@ -15,7 +15,8 @@ from conformance.requirements import requirements
 
 @dataclasses.dataclass(frozen=True)
 class ExpectedFailures:
-    """reasons: name of a check or id of a requirement -> why it fails. A requirement stands for every check that names it."""
+    """reasons: name of a check or id of a requirement -> why it fails. A requirement stands for every check that names
+    it."""
 
     reasons: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
@@ -37,7 +38,8 @@ class ExpectedFailures:
 def read_expected(path: Path) -> ExpectedFailures:
     """Reads lines such as `RET-1 = "bootstraps from its own value, as the paper prints it"`.
 
-    The name of a check may be written as it is, `returns.lambda_return_matches`: that a dot makes a table in TOML does no harm.
+    The name of a check may be written as it is, `returns.lambda_return_matches`: that a dot makes a table in TOML does
+    no harm.
 
     Raises:
       UserError: the file cannot be read, or names what there is not, or gives no reason.
@@ -53,7 +55,9 @@ def read_expected(path: Path) -> ExpectedFailures:
     for name, reason in reasons.items():
         if name not in known:
             close = difflib.get_close_matches(name, known, n=1)
-            raise UserError(f"{path}: no check and no requirement is named {name}" + (f"; is {close[0]} meant?" if close else ""))
+            raise UserError(
+                f"{path}: no check and no requirement is named {name}" + (f"; is {close[0]} meant?" if close else "")
+            )
         if not isinstance(reason, str) or not reason.strip():
             raise UserError(f"{path}: {name}: expected a reason as text, got {reason!r:.80}")
     return ExpectedFailures(reasons)
@@ -62,5 +66,9 @@ def read_expected(path: Path) -> ExpectedFailures:
 def _flat(entries: Mapping[str, Any]) -> dict[str, Any]:
     flat: dict[str, Any] = {}
     for name, entry in entries.items():
-        flat |= {f"{name}.{inner}": value for inner, value in _flat(entry).items()} if isinstance(entry, dict) else {name: entry}
+        flat |= (
+            {f"{name}.{inner}": value for inner, value in _flat(entry).items()}
+            if isinstance(entry, dict)
+            else {name: entry}
+        )
     return flat

@@ -12,15 +12,20 @@ from conformance.errors import UserError
 from spec import Config
 
 MAPPINGS = frozenset(
-    name for name in INTERFACE if str(inspect.signature(getattr(Adapter, name)).return_annotation).startswith("collections.abc.Mapping")
+    name
+    for name in INTERFACE
+    if str(inspect.signature(getattr(Adapter, name)).return_annotation).startswith("collections.abc.Mapping")
 )
 """Functions whose result is a mapping."""
 
 TAKE_ARRAYS = {
-    name: tuple(parameter.annotation is Array for parameter in inspect.signature(getattr(Adapter, name)).parameters.values())[1:]
+    name: tuple(
+        parameter.annotation is Array for parameter in inspect.signature(getattr(Adapter, name)).parameters.values()
+    )[1:]
     for name in INTERFACE
 }
-"""Every function -> for each of its arguments, whether it is an array. A single number then comes as an array without axes."""
+"""Every function -> for each of its arguments, whether it is an array. A single number then comes as an array without
+axes."""
 
 LATENTS = ("stoch", "logits", "posterior", "prior")
 """Where latents stand in a result: under these keys, or as the whole result of functions with these names."""
@@ -31,7 +36,8 @@ HOLD_LATENTS = (
 
 
 class ForeignAdapter(abc.ABC):
-    """An adapter that somebody else wrote. Subclasses say what is offered and how it is called, and give results of `to_numpy`."""
+    """An adapter that somebody else wrote. Subclasses say what is offered and how it is called, and give results of
+    `to_numpy`."""
 
     refuses_anyhow = True
     """What must be refused may end in an exception of any kind: nobody told its authors which."""
@@ -58,7 +64,9 @@ class ForeignAdapter(abc.ABC):
 
         def function(*arguments: Any) -> Any:
             kinds = zip(arguments, TAKE_ARRAYS[name], strict=False)  # whether the number fits is the candidate's to say
-            arguments = tuple(np.asarray(value) if is_array and np.isscalar(value) else value for value, is_array in kinds)
+            arguments = tuple(
+                np.asarray(value) if is_array and np.isscalar(value) else value for value, is_array in kinds
+            )
             result = self.call(name, arguments)
             return result if name in OBJECTS else arranged(name, arguments, result)
 
@@ -79,7 +87,8 @@ def as_edition(claim: Any) -> str | None:
 def arranged(name: str, arguments: Sequence[Any], result: Any) -> Any:
     """The result of a function of the interface as its checks expect it.
 
-    Several results may come as a tuple or by their names (RESULTS). Latents may be flat [..., S * C], samples may be class indices.
+    Several results may come as a tuple or by their names (RESULTS). Latents may be flat [..., S * C], samples may be
+    class indices.
 
     Raises:
       TypeError: it is of another kind: a mapping for an array, a tuple of other length, other names.
@@ -105,7 +114,11 @@ def arranged(name: str, arguments: Sequence[Any], result: Any) -> Any:
     if config is not None and name in LATENTS:
         return _latents(result, config)
     if config is not None and name in HOLD_LATENTS:
-        return tuple(_hold_latents(part, config) for part in result) if isinstance(result, tuple) else _hold_latents(result, config)
+        return (
+            tuple(_hold_latents(part, config) for part in result)
+            if isinstance(result, tuple)
+            else _hold_latents(result, config)
+        )
     return result
 
 

@@ -16,7 +16,8 @@ def unchecked(functions: Collection[str], results: Iterable[Result]) -> list[dic
     """Offered functions that no check was run with, because each check needs others too.
 
     Returns:
-      Entries with `function`, and `needs`: what the check lacks that lacks least. A function that no check was asked to use is left out.
+      Entries with `function`, and `needs`: what the check lacks that lacks least. A function that no check was asked to
+        use is left out.
     """
     results = list(results)
     found = []

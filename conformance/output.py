@@ -8,7 +8,8 @@ from typing import IO, Any, TextIO
 
 
 class _Descriptor(io.FileIO):
-    """A file descriptor that takes everything: what cannot be written (a closed pipe or terminal, a full disk) is dropped."""
+    """A file descriptor that takes everything: what cannot be written (a closed pipe or terminal, a full disk) is
+    dropped."""
 
     def write(self, data: Any) -> int:
         size = memoryview(data).nbytes
@@ -20,14 +21,17 @@ class _Descriptor(io.FileIO):
 
 
 def never_fail() -> None:
-    """From here on neither `print` to standard output or error, nor flushing them at the end of the process, raises an error.
+    """From here on neither `print` to standard output or error, nor flushing them at the end of the process, raises an
+    error.
 
-    A character that their encoding lacks is written as its escape. A descriptor that was closed when the process began is opened on the
-    null device: otherwise the next file to be opened would get its number, and what libraries print. Streams that somebody else has put
-    in place of the process's own, as notebooks and tests do, stay as they are.
+    A character that their encoding lacks is written as its escape. A descriptor that was closed when the process began
+    is opened on the null device: otherwise the next file to be opened would get its number, and what libraries print.
+    Streams that somebody else has put in place of the process's own, as notebooks and tests do, stay as they are.
     """
     open_descriptors()
-    sys.stdout = sys.stdout or sys.__stdout__ or os.fdopen(1, "w", closefd=False)  # None where its descriptor was closed
+    sys.stdout = (
+        sys.stdout or sys.__stdout__ or os.fdopen(1, "w", closefd=False)
+    )  # None where its descriptor was closed
     sys.stderr = sys.stderr or sys.__stderr__ or os.fdopen(2, "w", closefd=False)
     if sys.stdout is sys.__stdout__ and isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout = _unfailing(sys.stdout)

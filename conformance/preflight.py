@@ -1,8 +1,8 @@
 """Preflight: is this backend right on this very configuration, these spaces, this precision and this device?
 
-Small batch, few time steps, full-size networks: seconds for the small sizes. Networks are compared one by one on given states, so that any
-precision can be judged. In float64 and float32 whole losses and their gradient are compared too; in bfloat16 a sample may honestly fall
-into another class, after which nothing is comparable.
+Small batch, few time steps, full-size networks: seconds for the small sizes. Networks are compared one by one on given
+states, so that any precision can be judged. In float64 and float32 whole losses and their gradient are compared too; in
+bfloat16 a sample may honestly fall into another class, after which nothing is comparable.
 """
 
 import dataclasses
@@ -29,20 +29,24 @@ from spec import Config, Spaces
 ROWS = 2
 STEPS = 2
 SAMPLING_MARGIN = 1e-5
-# Far smaller than in the checks: a random network for images bends sharply, and here float64 loses 1e-8 of a derivative at most.
+# Far smaller than in the checks: a random network for images bends sharply, and here float64 loses 1e-8 of a derivative
+# at most.
 DIFFERENCE_STEP = 1e-6
-# In float32 about ten times and more what PyTorch deviates in sizes up to 50m (networks 2e-6, losses 3e-7, gradients 1e-5), and well below
-# what TF32 does to networks (5e-4): products of rounded operands, [LAY-1] forbids them.
+# In float32 about ten times and more what PyTorch deviates in sizes up to 50m (networks 2e-6, losses 3e-7, gradients
+# 1e-5), and well below what TF32 does to networks (5e-4): products of rounded operands, [LAY-1] forbids them.
 NETWORK_BOUND = {"float64": 1e-9, "float32": 2e-5, "bfloat16": 0.1}
 LOSS_BOUND = {"float64": 1e-8, "float32": 1e-5}
 GRADIENT_BOUND = {"float64": 1e-5, "float32": 2e-4}
 
-Compared = Iterator[tuple[str, Callable[..., object]]]  # what has just been compared, and the function of the reference that says it
+Compared = Iterator[
+    tuple[str, Callable[..., object]]
+]  # what has just been compared, and the function of the reference that says it
 
 
 @dataclasses.dataclass(frozen=True)
 class Comparison:
-    """What agreed. requirements: those that its function in the reference names. share: worst deviation as a share of the allowed one."""
+    """What agreed. requirements: those that its function in the reference names. share: worst deviation as a share of
+    the allowed one."""
 
     name: str
     requirements: list[str]
@@ -51,7 +55,8 @@ class Comparison:
 
 @dataclasses.dataclass(frozen=True)
 class Report:
-    """passed: whether training may start. worst: largest deviation, relative to the size of what deviates. summary: one line.
+    """passed: whether training may start. worst: largest deviation, relative to the size of what deviates. summary: one
+    line.
 
     comparisons: what agreed, up to the first deviation.
     """
@@ -78,7 +83,9 @@ def preflight(
     return preflight_adapter(load_adapter(backend, config.compute_dtype, device), spaces, config, seed, progress)
 
 
-def preflight_adapter(adapter: object, spaces: Spaces, config: Config, seed: int = 0, progress: Callable[[str], None] = _silent) -> Report:
+def preflight_adapter(
+    adapter: object, spaces: Spaces, config: Config, seed: int = 0, progress: Callable[[str], None] = _silent
+) -> Report:
     """Compares any adapter with the reference. progress: see `preflight`."""
     small = dataclasses.replace(config, batch_size=ROWS, batch_length=STEPS, imagination_horizon=STEPS)
     run = Run(adapter, config.compute_dtype, "", seed)
@@ -89,7 +96,9 @@ def preflight_adapter(adapter: object, spaces: Spaces, config: Config, seed: int
     for name, part in parts:
         try:
             for what, function in part(run, spaces, small):
-                comparisons.append(Comparison(what, re.findall(r"\[([A-Z]+-\d+)\]", function.__doc__ or ""), run.worst.share))
+                comparisons.append(
+                    Comparison(what, re.findall(r"\[([A-Z]+-\d+)\]", function.__doc__ or ""), run.worst.share)
+                )
                 worst, run.worst = max(worst, run.worst.deviation), Worst()
                 progress(what)
         except Deviation as deviation:
@@ -125,7 +134,8 @@ def compare_networks(run: Run, spaces: Spaces, config: Config) -> Compared:
 
 
 def compare_losses(run: Run, spaces: Spaces, config: Config) -> Compared:
-    """Every loss of a training step, and the derivative of the total along random directions, where the candidate has gradients."""
+    """Every loss of a training step, and the derivative of the total along random directions, where the candidate has
+    gradients."""
     problem = comparable_problem(run, spaces, config)
     total, aux = agent.losses(*problem.loss_arguments)
     actual_total, actual = run.call("losses", *problem.loss_arguments)

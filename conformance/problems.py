@@ -1,7 +1,8 @@
 """Small problems for the checks: spaces, configurations, parameters, batches and noise, drawn from a seed.
 
-They are small but nothing in them is degenerate: sides, sizes and channel counts differ from each other, every parameter is random (the
-reward and critic outputs too, which start at zero in training), episodes begin, end and are cut inside the sequences.
+They are small but nothing in them is degenerate: sides, sizes and channel counts differ from each other, every
+parameter is random (the reward and critic outputs too, which start at zero in training), episodes begin, end and are
+cut inside the sequences.
 """
 
 import dataclasses
@@ -67,11 +68,14 @@ def small_config(profile: str, dtype: str = "float64", **overrides: Any) -> Conf
     return load_config(profile, "tiny", compute_dtype=dtype, **{**SMALL, **overrides})
 
 
-def random_parameters(rng: np.random.Generator, config: Config, task: Spaces, dtype: str = "float64") -> dict[str, np.ndarray]:
+def random_parameters(
+    rng: np.random.Generator, config: Config, task: Spaces, dtype: str = "float64"
+) -> dict[str, np.ndarray]:
     """Every entry of the table, none of them zero or one.
 
-    The latents' logits are spread out, so that some KL divergences lie above the free nats and some below. Rewards and values lean
-    towards the bins around zero, so that returns are of the size of real ones and not of the outermost bins.
+    The latents' logits are spread out, so that some KL divergences lie above the free nats and some below. Rewards and
+    values lean towards the bins around zero, so that returns are of the size of real ones and not of the outermost
+    bins.
     """
     params = {}
     for name, entry in parameter_table(config, task).items():
@@ -118,7 +122,8 @@ def random_carry(rng: np.random.Generator, config: Config, leading: tuple[int, .
 
 
 def random_batch(rng: np.random.Generator, config: Config, task: Spaces) -> dict[str, np.ndarray]:
-    """A replay batch. Row 0 holds a termination followed by a reset, row 1 a truncation, and the last row ends in a terminal step."""
+    """A replay batch. Row 0 holds a termination followed by a reset, row 1 a truncation, and the last row ends in a
+    terminal step."""
     B, T = config.batch_size, config.batch_length
     is_last = np.zeros((B, T), bool)
     is_terminal = np.zeros((B, T), bool)
@@ -163,43 +168,63 @@ def train_noise(rng: np.random.Generator, config: Config, task: Spaces) -> dict[
 
 
 def random_state(rng: np.random.Generator, config: Config, task: Spaces, dtype: str = "float64") -> dict[str, Any]:
-    """A training state in the middle of training: moments, a slow critic and a return range of their own, ten updates made."""
+    """A training state in the middle of training: moments, a slow critic and a return range of their own, ten updates
+    made."""
     stored = "float32" if dtype == "bfloat16" else dtype
     params = random_parameters(rng, config, task, dtype)
     return {
         "params": params,
         "slow_critic": {
-            name: round_to(value + rng.normal(0, 0.05, value.shape), stored) for name, value in params.items() if name.startswith("critic/")
+            name: round_to(value + rng.normal(0, 0.05, value.shape), stored)
+            for name, value in params.items()
+            if name.startswith("critic/")
         },
         "optimizer": {
             "step": 10,
-            "second_moment": {name: round_to(rng.uniform(0.01, 1, value.shape), stored) for name, value in params.items()},
+            "second_moment": {
+                name: round_to(rng.uniform(0.01, 1, value.shape), stored) for name, value in params.items()
+            },
             "momentum": {name: round_to(rng.normal(0, 1, value.shape), stored) for name, value in params.items()},
         },
         "return_range": {"low": -0.75, "high": 1.5},
     }
 
 
-def make_problem(seed: int, profile: str, observation: str, action: str, dtype: str = "float64", **overrides: Any) -> Problem:
+def make_problem(
+    seed: int, profile: str, observation: str, action: str, dtype: str = "float64", **overrides: Any
+) -> Problem:
     rng = np.random.default_rng(seed)
     config, task = small_config(profile, dtype, **overrides), spaces(observation, action)
-    return Problem(task, config, random_state(rng, config, task, dtype), random_batch(rng, config, task), train_noise(rng, config, task))
+    return Problem(
+        task,
+        config,
+        random_state(rng, config, task, dtype),
+        random_batch(rng, config, task),
+        train_noise(rng, config, task),
+    )
 
 
 def nudged(problem: Problem, distance: float) -> Problem:
     """The problem with all its uniform numbers moved by a distance; normal numbers stay."""
-    is_uniform = [isinstance(space, Discrete) for space in problem.spaces.actions.values() for _ in range(space.array_shape[0])]
+    is_uniform = [
+        isinstance(space, Discrete) for space in problem.spaces.actions.values() for _ in range(space.array_shape[0])
+    ]
     shift = {"posterior": distance, "prior": distance, "action": distance * np.array(is_uniform)}
     noise = {name: value + shift[name] for name, value in problem.noise.items()}
     return dataclasses.replace(problem, noise=noise)
 
 
 def with_sampling_margin(
-    draw: Callable[[int], Problem], margin: float, accept: Callable[[Problem], bool] = lambda problem: True, attempts: int = 1000
+    draw: Callable[[int], Problem],
+    margin: float,
+    accept: Callable[[Problem], bool] = lambda problem: True,
+    attempts: int = 1000,
 ) -> Problem:
-    """The first of draw(0), draw(1), ... that is accepted, and in which honest rounding moves no sample into another class.
+    """The first of draw(0), draw(1), ... that is accepted, and in which honest rounding moves no sample into another
+    class.
 
-    It is so when moving every uniform number by the margin, to both sides, changes the total of the reference in no bit.
+    It is so when moving every uniform number by the margin, to both sides, changes the total of the reference in no
+    bit.
 
     Raises:
       RuntimeError: none of that many attempts gives such a problem.

@@ -1,8 +1,9 @@
 """The process door: an implementation in a process of its own, asked by JSON lines over its standard input and output.
 
-Every request has one reply, and the next request is sent after it. Whatever the other side does, the kit gets a result: a process that
-dies, hangs, babbles or breaks the protocol is `CandidateLost`, which ends the check; the next check starts it anew. The messages are those
-of protocol.schema.json, docs/adapters.md explains them, serve.py is the other side for Python.
+Every request has one reply, and the next request is sent after it. Whatever the other side does, the kit gets a result:
+a process that dies, hangs, babbles or breaks the protocol is `CandidateLost`, which ends the check; the next check
+starts it anew. The messages are those of protocol.schema.json, docs/adapters.md explains them, serve.py is the other
+side for Python.
 """
 
 import collections
@@ -32,7 +33,9 @@ VALUES = 200_000  # numbers, texts, lists, maps and arrays in one result
 FUNCTIONS = 5000  # that a process may offer: a module with all of its imports has some hundreds
 NAME = 200  # characters of a name
 TEXT = 20_000  # characters of an error that are kept: a long traceback
-IN_ALL = 100  # times the timeout: what the replies of all checks may take together, repetitions for smaller cases included
+IN_ALL = (
+    100  # times the timeout: what the replies of all checks may take together, repetitions for smaller cases included
+)
 STDERR_LINES = 10
 RAISED = {"ValueError": ValueError, "KeyError": KeyError, "NotImplementedError": NotImplementedError}
 """Errors that the requirements ask for, and what is not implemented; others are a `CandidateError`."""
@@ -43,11 +46,15 @@ class CandidateError(Exception):
 
 
 def describe(value: Any) -> Any:
-    """A configuration, spaces or a table entry in plain JSON types: its fields, what is derived from them, and its kind."""
+    """A configuration, spaces or a table entry in plain JSON types: its fields, what is derived from them, and its
+    kind."""
     if dataclasses.is_dataclass(value):
         fields = [field.name for field in dataclasses.fields(value)]
         derived = [name for name, entry in vars(type(value)).items() if isinstance(entry, property)]
-        return {"kind": type(value).__name__.lower(), **{name: describe(getattr(value, name)) for name in (*fields, *derived)}}
+        return {
+            "kind": type(value).__name__.lower(),
+            **{name: describe(getattr(value, name)) for name in (*fields, *derived)},
+        }
     if isinstance(value, Mapping):
         return {key: describe(entry) for key, entry in value.items()}
     if isinstance(value, tuple):
@@ -67,12 +74,18 @@ def encode_argument(value: Any) -> Any:
 
 
 class Connection:
-    """A running process. Threads read its output, so that no pipe of it fills up and nothing that it does blocks the kit."""
+    """A running process. Threads read its output, so that no pipe of it fills up and nothing that it does blocks the
+    kit."""
 
     def __init__(self, command: list[str]) -> None:
         """Raises OSError if there is no such program."""
         self.process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, bufsize=0, start_new_session=True
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            bufsize=0,
+            start_new_session=True,
         )
         assert self.process.stdin is not None
         assert self.process.stdout is not None
@@ -114,7 +127,9 @@ class Connection:
             code = self.process.wait(timeout=2)
         except subprocess.TimeoutExpired:
             return "closed its standard output"
-        return f"was ended by signal {-code} ({signal.strsignal(-code)})" if code < 0 else f"ended with exit code {code}"
+        return (
+            f"was ended by signal {-code} ({signal.strsignal(-code)})" if code < 0 else f"ended with exit code {code}"
+        )
 
     def last_errors(self) -> list[str]:
         """The last lines of its standard error."""
@@ -139,7 +154,11 @@ class Connection:
         """Until there is more than can become a reply, so that nobody fills the memory."""
         pieces: list[bytes] = []
         with contextlib.suppress(OSError, ValueError), stdout:
-            while self.partial <= MESSAGE_BYTES and self._lines.qsize() <= BABBLE_LINES + 1 and (chunk := stdout.read(2**20)):
+            while (
+                self.partial <= MESSAGE_BYTES
+                and self._lines.qsize() <= BABBLE_LINES + 1
+                and (chunk := stdout.read(2**20))
+            ):
                 *ends, rest = chunk.split(b"\n")
                 for end in ends:
                     self._lines.put(b"".join([*pieces, end]))
@@ -201,7 +220,13 @@ class ProcessAdapter(ForeignAdapter):
         try:
             _require_plain(result)
             return to_numpy(decode(result))
-        except (BadMessage, TypeError, ValueError, OverflowError, RecursionError) as error:  # a ValueError here refuses no argument
+        except (
+            BadMessage,
+            TypeError,
+            ValueError,
+            OverflowError,
+            RecursionError,
+        ) as error:  # a ValueError here refuses no argument
             raise CandidateError(f"{name}: {_shortened(str(error))}") from error
         finally:
             self._waited += time.monotonic() - began
@@ -251,7 +276,9 @@ class ProcessAdapter(ForeignAdapter):
         if self._connection is None:
             self._start()
         if self._waited > IN_ALL * self._timeout:
-            raise CandidateLost(f"its replies have taken more than {IN_ALL * self._timeout:g} s in all, {IN_ALL} times --timeout")
+            raise CandidateLost(
+                f"its replies have taken more than {IN_ALL * self._timeout:g} s in all, {IN_ALL} times --timeout"
+            )
         began = time.monotonic()
         try:
             return self._exchange(method, content)
@@ -277,7 +304,9 @@ class ProcessAdapter(ForeignAdapter):
                     raise RAISED[kind](_shortened(message))
                 raise CandidateError(f"{kind:.{NAME}}: {_shortened(message)}")
         keys = f"{sorted(reply)!s:.{NAME}}"
-        raise self._lost(what, f"a reply needs either a result or an error with kind and message as text, got the keys {keys}")
+        raise self._lost(
+            what, f"a reply needs either a result or an error with kind and message as text, got the keys {keys}"
+        )
 
     def _reply(self, what: str, deadline: float) -> dict[str, Any]:
         """The next line that is a message. Others are shown and left out, up to BABBLE_LINES of one process."""
@@ -286,7 +315,9 @@ class ProcessAdapter(ForeignAdapter):
             try:
                 line = self._connection.receive(deadline)
             except TimeoutError:
-                half = f"; {self._connection.partial} bytes of an unfinished line came" if self._connection.partial else ""
+                half = (
+                    f"; {self._connection.partial} bytes of an unfinished line came" if self._connection.partial else ""
+                )
                 raise self._lost(what, f"no reply within {self._timeout:g} s{half}") from None
             if line is None:
                 raise self._lost(what, self._why_ended())
@@ -299,7 +330,9 @@ class ProcessAdapter(ForeignAdapter):
             self._babble += 1
             text = line[:200].decode(errors="replace")
             if self._babble > BABBLE_LINES:
-                raise self._lost(what, f"more than {BABBLE_LINES} lines on standard output are no messages, the last: {text!r}")
+                raise self._lost(
+                    what, f"more than {BABBLE_LINES} lines on standard output are no messages, the last: {text!r}"
+                )
             print(f"{self._command[0]}: {text}", file=sys.stderr)
 
     def _why_ended(self) -> str:
@@ -355,5 +388,7 @@ def _problem_of_start(started: Any) -> str:
     if not isinstance(functions, list) or not all(isinstance(name, str) for name in functions):
         return f"expected the names of the functions as a list of text, got {functions!r:.80}"
     if len(functions) > FUNCTIONS or any(len(name) > NAME for name in functions):
-        return f"expected at most {FUNCTIONS:,} functions with names of at most {NAME} characters, got {len(functions):,}"
+        return (
+            f"expected at most {FUNCTIONS:,} functions with names of at most {NAME} characters, got {len(functions):,}"
+        )
     return ""

@@ -15,7 +15,9 @@ def requirements() -> dict[str, str]:
       ValueError: an id that two requirements share.
     """
     found: dict[str, str] = {}
-    for chapter in sorted(path.name for path in resources.files("spec").iterdir() if re.match(r"\d\d-.*\.md$", path.name)):
+    for chapter in sorted(
+        path.name for path in resources.files("spec").iterdir() if re.match(r"\d\d-.*\.md$", path.name)
+    ):
         text = resources.files("spec").joinpath(chapter).read_text(encoding="utf-8")
         for identifier, lines in _REQUIREMENT.findall(text):
             if identifier in found:

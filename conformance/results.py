@@ -1,4 +1,5 @@
-"""The result of a run as plain JSON types: report.schema.json says what is in it. Every report is made from it and from nothing else."""
+"""The result of a run as plain JSON types: report.schema.json says what is in it. Every report is made from it and from
+nothing else."""
 
 import dataclasses
 import functools
@@ -37,7 +38,8 @@ def versions() -> dict[str, str]:
 
 
 def identity(adapter: object, candidate: str) -> Data:
-    """Name, version, claimed edition and functions of the candidate. One of our own columns has the version of the kit, and claims none."""
+    """Name, version, claimed edition and functions of the candidate. One of our own columns has the version of the kit,
+    and claims none."""
     if isinstance(adapter, ForeignAdapter):
         claimed = adapter.edition()
         about = {"name": adapter.name, "version": adapter.version, "edition": None if claimed is None else str(claimed)}
@@ -78,7 +80,8 @@ def result_data(
         "versions": versions(),
         "verdict": verdict(settings, results, expected),
         "expected_failures": [
-            {"name": name, "reason": reason, "outcome": expected.outcome(name, results)} for name, reason in expected.reasons.items()
+            {"name": name, "reason": reason, "outcome": expected.outcome(name, results)}
+            for name, reason in expected.reasons.items()
         ],
         "checks": {result.check.name: _check(result, settings, expected) for result in results},
         "requirements": {row.requirement: _requirement(row) for row in rows(results)},
@@ -88,10 +91,16 @@ def result_data(
 
 def verdict(settings: Settings, results: Sequence[Result], expected: ExpectedFailures) -> Data:
     """Whether the run passed, and what stands against it."""
-    statuses = [result.status for result in results if expected.reason(result.check) is None or result.status not in FAILING]
+    statuses = [
+        result.status for result in results if expected.reason(result.check) is None or result.status not in FAILING
+    ]
     failing, passing = sum(status in FAILING for status in statuses), statuses.count("pass")
     problems = [f"{_checks(failing)} failed"] if failing else []
-    problems += [f"{name} passes, and is expected to fail" for name in expected.reasons if expected.outcome(name, results) == "pass"]
+    problems += [
+        f"{name} passes, and is expected to fail"
+        for name in expected.reasons
+        if expected.outcome(name, results) == "pass"
+    ]
     if passing < settings.at_least:
         problems.append(f"{_checks(passing)} passed, and at least {settings.at_least} must")
     return {"passed": not problems, "problems": problems}
@@ -136,7 +145,8 @@ def write(path: Path, report: Data) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Characters of a candidate's messages that no encoding has are escaped. Raises UserError where it is not possible."""
+    """Characters of a candidate's messages that no encoding has are escaped. Raises UserError where it is not
+    possible."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text, encoding="utf-8", errors="backslashreplace")
@@ -160,15 +170,25 @@ def read(path: Path) -> Data:
     except (ValueError, RecursionError) as error:
         raise UserError(f"{path} is not JSON: {error}") from error
     if problem := misfit(data, schema()):
-        raise UserError(f"{path} is not a result of format {FORMAT}: {problem}; make one with: conformance check ... --json {path}")
+        raise UserError(
+            f"{path} is not a result of format {FORMAT}: {problem}; make one with: conformance check ... --json {path}"
+        )
     return dict(data)
 
 
-_KINDS: dict[str, Any] = {"object": dict, "array": list, "string": str, "boolean": bool, "null": type(None), "number": int | float}
+_KINDS: dict[str, Any] = {
+    "object": dict,
+    "array": list,
+    "string": str,
+    "boolean": bool,
+    "null": type(None),
+    "number": int | float,
+}
 
 
 def misfit(value: Any, rule: Mapping[str, Any], place: str = "it") -> str:
-    """What is the first thing in a value that the schema does not allow; "" if all is well. Knows the words that our schema uses."""
+    """What is the first thing in a value that the schema does not allow; "" if all is well. Knows the words that our
+    schema uses."""
     if "$ref" in rule:
         rule = schema()["$defs"][rule["$ref"].removeprefix("#/$defs/")]
     kinds = [rule["type"]] if isinstance(rule.get("type"), str) else rule.get("type", [])
@@ -184,7 +204,9 @@ def misfit(value: Any, rule: Mapping[str, Any], place: str = "it") -> str:
     if isinstance(value, dict):
         return _misfit_in_object(value, rule, place)
     if isinstance(value, list) and "items" in rule:
-        return next(filter(None, (misfit(entry, rule["items"], f"{place}[{index}]") for index, entry in enumerate(value))), "")
+        return next(
+            filter(None, (misfit(entry, rule["items"], f"{place}[{index}]") for index, entry in enumerate(value))), ""
+        )
     return ""
 
 

@@ -3,8 +3,9 @@
     python -m conformance.serve my_adapter.py
     python serve.py my_adapter.py                 where only this file was copied
 
-It needs NumPy and what the adapter itself imports, and nothing else of this project. What the adapter prints goes to standard error.
-Nothing is unpickled and no code is received: a message holds numbers, text and arrays. The format: protocol.schema.json, docs/adapters.md.
+It needs NumPy and what the adapter itself imports, and nothing else of this project. What the adapter prints goes to
+standard error. Nothing is unpickled and no code is received: a message holds numbers, text and arrays. The format:
+protocol.schema.json, docs/adapters.md.
 """
 
 from __future__ import annotations
@@ -30,11 +31,13 @@ DTYPES = ("bool", "uint8", "int32", "int64", "float32", "float64")
 
 
 class BadMessage(Exception):
-    """A message that does not follow the protocol. Not a ValueError: that is how an implementation refuses an argument."""
+    """A message that does not follow the protocol. Not a ValueError: that is how an implementation refuses an
+    argument."""
 
 
 def to_numpy(value: Any) -> Any:
-    """What an implementation returned, with NumPy arrays of one of DTYPES, plain numbers, tuples, and mappings with text as keys.
+    """What an implementation returned, with NumPy arrays of one of DTYPES, plain numbers, tuples, and mappings with
+    text as keys.
 
     Tensors may require gradients and lie on a device. Named tuples, dataclasses and what has items() become mappings.
 
@@ -71,7 +74,8 @@ def _to_array(value: Any) -> np.ndarray:
 
 
 def encode(value: Any) -> Any:
-    """A value in plain JSON types: arrays as {"dtype", "shape", "data"}, mappings as {"map": ...}, NaN and infinities as arrays."""
+    """A value in plain JSON types: arrays as {"dtype", "shape", "data"}, mappings as {"map": ...}, NaN and infinities
+    as arrays."""
     if value is None or isinstance(value, (bool, int, str)):
         return value
     if isinstance(value, float) and math.isfinite(value) and not isinstance(value, np.generic):
@@ -86,7 +90,8 @@ def encode(value: Any) -> Any:
 
 
 def decode(value: Any) -> Any:
-    """The inverse of `encode`. {"object": ...}, a configuration or spaces, becomes a namespace: config.units, spaces.actions["arm"].size.
+    """The inverse of `encode`. {"object": ...}, a configuration or spaces, becomes a namespace: config.units,
+    spaces.actions["arm"].size.
 
     Raises:
       BadMessage: it does not follow the protocol.
@@ -115,7 +120,9 @@ def _decode_array(dtype: Any, shape: Any, data: Any) -> np.ndarray:
         raise BadMessage(f"the data of an array are not base64: {error}") from error
     kind = np.dtype(dtype).newbyteorder("<")
     if len(raw) != kind.itemsize * math.prod(shape):
-        raise BadMessage(f"an array of {dtype} and shape {shape} takes {kind.itemsize * math.prod(shape)} bytes, got {len(raw)}")
+        raise BadMessage(
+            f"an array of {dtype} and shape {shape} takes {kind.itemsize * math.prod(shape)} bytes, got {len(raw)}"
+        )
     return np.frombuffer(raw, kind).astype(dtype).reshape(shape)
 
 
@@ -142,7 +149,8 @@ def answer(adapter: Any, request: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def missing_field(error: Exception) -> str:
-    """Of an error because a configuration or spaces lack what was asked of them: the closest that they have. Of others nothing."""
+    """Of an error because a configuration or spaces lack what was asked of them: the closest that they have. Of others
+    nothing."""
     given = getattr(error, "obj", None) if isinstance(error, AttributeError) else None
     if not isinstance(given, SimpleNamespace) and (not dataclasses.is_dataclass(given) or isinstance(given, type)):
         return ""
@@ -158,7 +166,12 @@ def _result(adapter: Any, request: Mapping[str, Any]) -> Any:
             raise BadMessage(f"this server speaks protocol {PROTOCOL}, not {request.get('protocol')!r}")
         getattr(adapter, "setup", lambda dtype: None)(request["dtype"])
         names = [name for name in dir(adapter) if not name.startswith("_") and callable(getattr(adapter, name))]
-        return {"protocol": PROTOCOL, "name": adapter.__name__, "version": str(getattr(adapter, "__version__", "")), "functions": names}
+        return {
+            "protocol": PROTOCOL,
+            "name": adapter.__name__,
+            "version": str(getattr(adapter, "__version__", "")),
+            "functions": names,
+        }
     if method == "edition":
         return getattr(adapter, "edition", lambda: None)()
     if method == "run":
@@ -211,8 +224,8 @@ def main() -> None:
     # Run as a file, its directory comes first on the path, where other modules may hide those of the standard library.
     if not __package__ and os.path.realpath(sys.path[0]) == os.path.dirname(os.path.realpath(__file__)):
         del sys.path[0]
-    # Messages have the pipes to themselves: what anything else prints, C libraries included, goes to standard error, and what
-    # anything else reads, programs that the adapter starts included, is empty.
+    # Messages have the pipes to themselves: what anything else prints, C libraries included, goes to standard error,
+    # and what anything else reads, programs that the adapter starts included, is empty.
     requests, replies = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
     os.dup2(2, 1)

@@ -1,4 +1,5 @@
-"""A commented module to start an adapter from, made of the interface and of what the reference says of each function."""
+"""A commented module to start an adapter from, made of the interface and of what the reference says of each
+function."""
 
 import importlib
 import inspect
@@ -11,15 +12,16 @@ from conformance.adapter import CONFIG_FIELDS, INTERFACE, Adapter, Hooks
 
 HEADER = '''"""An adapter: what `conformance check {name}` calls.
 
-Uncomment what your implementation offers and call your own code in it. Everything is optional. Arrays come in as NumPy, rows first and
-time second; give back arrays of any library. `docs/adapters.md` of dreamer-spec explains the rest. Good first functions: lambda_return,
-kl_losses, symexp_twohot_loss and core, where most mistakes are.
+Uncomment what your implementation offers and call your own code in it. Everything is optional. Arrays come in as
+NumPy, rows first and time second; give back arrays of any library. `docs/adapters.md` of dreamer-spec explains the
+rest. Good first functions: lambda_return, kl_losses, symexp_twohot_loss and core, where most mistakes are.
 
-Numbers that come as arguments, and those of `config`, vary from call to call: hand them on, as a number written into the code fails. Where
-`config` makes a choice that your code does not have, raise NotImplementedError("which one").
+Numbers that come as arguments, and those of `config`, vary from call to call: hand them on, as a number written into
+the code fails. Where `config` makes a choice that your code does not have, raise NotImplementedError("which one").
 
-In the shapes: B sequences of T steps, N starts of H imagined steps, D memory units, S latents of C classes, A numbers of a flat action.
-`params` is a dict from canonical names (`rssm/gru/kernel`) to arrays: your function brings them into its own layers first.
+In the shapes: B sequences of T steps, N starts of H imagined steps, D memory units, S latents of C classes, A numbers
+of a flat action. `params` is a dict from canonical names (`rssm/gru/kernel`) to arrays: your function brings them
+into its own layers first.
 """
 '''
 ROWS = (
@@ -29,14 +31,24 @@ ROWS = (
 
 
 FIRST = (
-    *("symlog", "symexp", "unimix_log_probs", "symexp_twohot_loss", "symexp_twohot_mean", "core", "kl_losses", "lambda_return"),
+    *(
+        "symlog",
+        "symexp",
+        "unimix_log_probs",
+        "symexp_twohot_loss",
+        "symexp_twohot_mean",
+        "core",
+        "kl_losses",
+        "lambda_return",
+    ),
     *("cumulative_weights", "update_return_range", "return_scale", "actor_loss", "critic_loss"),
 )
 """Functions to begin with: most code bases have them apart, and most mistakes are in them."""
 
 
 def skeleton(name: str, short: bool = False) -> str:
-    """The source of a module that offers nothing yet, for an adapter of that file name. short: it describes only the FIRST functions."""
+    """The source of a module that offers nothing yet, for an adapter of that file name. short: it describes only the
+    FIRST functions."""
     parts = [
         HEADER.format(name=name),
         _title("what is not part of the algorithm"),
@@ -45,15 +57,24 @@ def skeleton(name: str, short: bool = False) -> str:
     rows = functions_by_row()
     for row, functions in rows.items():
         if chosen := [name for name in functions if name in FIRST or not short]:
-            parts += [_title(f"{row.replace('_', ' ')}: spec/{chapter(row)}"), *(_commented(name, described(name)) for name in chosen)]
+            parts += [
+                _title(f"{row.replace('_', ' ')}: spec/{chapter(row)}"),
+                *(_commented(name, described(name)) for name in chosen),
+            ]
     return "\n".join([*parts, *([_others(rows)] if short else [])])
 
 
 def _others(rows: Mapping[str, Sequence[str]]) -> str:
     """A comment that names the functions which are not among the FIRST."""
     title = _title("what else can be offered: `conformance new-adapter` without --short describes it")
-    lines = (f"{row.replace('_', ' ')}: {', '.join(name for name in functions if name not in FIRST)}" for row, functions in rows.items())
-    wrapped = (textwrap.fill(line, 100, initial_indent="# ", subsequent_indent="#   ", break_on_hyphens=False) for line in lines)
+    lines = (
+        f"{row.replace('_', ' ')}: {', '.join(name for name in functions if name not in FIRST)}"
+        for row, functions in rows.items()
+    )
+    wrapped = (
+        textwrap.fill(line, 100, initial_indent="# ", subsequent_indent="#   ", break_on_hyphens=False)
+        for line in lines
+    )
     return title + "\n" + "\n".join(wrapped) + "\n"
 
 
@@ -61,7 +82,8 @@ HOOKS = tuple(name for name, hook in vars(Hooks).items() if inspect.isfunction(h
 
 
 def functions_by_row() -> dict[str, list[str]]:
-    """Row of the grid -> its functions of the interface. What the reference lacks belongs to the row of the one before."""
+    """Row of the grid -> its functions of the interface. What the reference lacks belongs to the row of the one
+    before."""
     modules = {row: importlib.import_module(f"reference_numpy.{row}") for row in ROWS}
     found: dict[str, list[str]] = {row: [] for row in ROWS}
     current = ROWS[0]
@@ -73,7 +95,11 @@ def functions_by_row() -> dict[str, list[str]]:
 
 def chapter(row: str) -> str:
     """The file of a row's chapter."""
-    return next(path.name for path in resources.files("spec").iterdir() if re.fullmatch(rf"\d\d-{row.replace('_', '-')}\.md", path.name))
+    return next(
+        path.name
+        for path in resources.files("spec").iterdir()
+        if re.fullmatch(rf"\d\d-{row.replace('_', '-')}\.md", path.name)
+    )
 
 
 def described(name: str) -> object:
@@ -111,6 +137,7 @@ def _brief(documented: object, fields: Sequence[str]) -> str:
     if fields:
         config = textwrap.fill(f"config: {', '.join(fields)}.", 100, initial_indent="  ", subsequent_indent="    ")
         sections = [f"{section}\n{config}" if section.startswith("Args:") else section for section in sections]
-    meaning = re.sub(r"\s+", " ", re.sub(r"Implements \[.*?\](?:(?:, | to | and )\[.*?\])*[^.\[]*\.?", "", first, flags=re.DOTALL)).strip()
+    sentences = " ".join(first.split())
+    meaning = re.sub(r" ?Implements \[.*?\](?:(?:, | to | and )\[.*?\])*[^.\[]*\.?", "", sentences).strip()
     text = "\n\n".join([meaning, *sections])
     return f'"""{text}\n"""' if sections else f'"""{text}"""'

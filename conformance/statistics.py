@@ -1,13 +1,15 @@
 """How far samples may be from their distribution: bounds that hold for every number of samples, not only in the limit.
 
-A statistical check is wrong about a right sampler with some probability. Over all checks of one run together it is at most FALSE_ALARMS:
-the run makes a known number of tests, each is allowed its share (the union bound), and each radius below is exceeded with at most the
-probability 2 exp(-L), where L = `confidence(tests)` = ln(2 CHECKS tests / FALSE_ALARMS), for a check with that many tests:
+A statistical check is wrong about a right sampler with some probability. Over all checks of one run together it is at
+most FALSE_ALARMS: the run makes a known number of tests, each is allowed its share (the union bound), and each radius
+below is exceeded with at most the probability 2 exp(-L), where L = `confidence(tests)` = ln(2 CHECKS tests /
+FALSE_ALARMS), for a check with that many tests:
 
   CHECKS checks x `tests` tests x 2 exp(-L) = FALSE_ALARMS.
 
-The radii are inequalities and thus somewhat wide: what is rejected deserves it. The numbers that computers call random, and their rounding,
-stand for real ones: frequencies differ from those of real numbers by some 1e-7, far less than any radius here.
+The radii are inequalities and thus somewhat wide: what is rejected deserves it. The numbers that computers call random,
+and their rounding, stand for real ones: frequencies differ from those of real numbers by some 1e-7, far less than any
+radius here.
 """
 
 import math
@@ -26,7 +28,8 @@ def confidence(tests: int) -> float:
 
 
 def mean_radius(variance: np.ndarray | float, largest: float, n: int, confidence: float) -> np.ndarray:
-    """Of the mean of n samples with this variance, none farther than `largest` from the expectation: Bernstein's inequality.
+    """Of the mean of n samples with this variance, none farther than `largest` from the expectation: Bernstein's
+    inequality.
 
     P(|mean - expectation| >= r) <= 2 exp(-n r^2 / (2 variance + 2 largest r / 3)), solved for r.
     """
@@ -45,12 +48,14 @@ def normal_mean_radius(n: int, confidence: float) -> float:
 
 
 def normal_square_radius(n: int, confidence: float) -> float:
-    """Of the mean square of n standard normals: the inequality of Laurent and Massart for the chi-square distribution."""
+    """Of the mean square of n standard normals: the inequality of Laurent and Massart for the chi-square
+    distribution."""
     return 2 * math.sqrt(confidence / n) + 2 * confidence / n
 
 
 def distribution_radius(n: int, confidence: float) -> float:
-    """Of `distribution_distance`: the inequality of Dvoretzky, Kiefer and Wolfowitz with the constant of Massart, 2 exp(-2 n r^2)."""
+    """Of `distribution_distance`: the inequality of Dvoretzky, Kiefer and Wolfowitz with the constant of Massart, 2
+    exp(-2 n r^2)."""
     return math.sqrt(confidence / (2 * n))
 
 

@@ -24,7 +24,8 @@ def ordinary_numbers(only: bool) -> Iterator[None]:
 
 
 def adversarial_numbers(finite: bool = False) -> st.SearchStrategy[float]:
-    """Both zeros, subnormals, ordinary, huge, bin edges and their float neighbours, and unless `finite` the infinities and NaN."""
+    """Both zeros, subnormals, ordinary, huge, bin edges and their float neighbours, and unless `finite` the infinities
+    and NaN."""
     if _ordinary:
         return st.one_of(st.sampled_from([0.0, 1.0, -1.0, 300.0]), st.integers(-1024, 1024).map(lambda n: n / 64))
     special = [0.0, -0.0, 1e-45, -1e-45, 1e-310, 1e-38, 1.0, -1.0, 1e-8, 0.1, 300.0, 1e30, -1e30, 3e38, -3e38]

@@ -24,8 +24,8 @@ from conformance.commands.mutants import is_named
 from conformance.reports import summary
 from conformance.requirements import chapter_of, requirements
 from docs import strangers
+from dreamer_spec.report import catalogue
 from spec import Edition, benchmarks, editions, hyperparameters, profiles, sizes
-from train.report import catalogue
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "docs" / "results"
@@ -53,19 +53,27 @@ def hyperparameter_table() -> str:
     """Every hyperparameter with its value in each profile."""
     rows = []
     for name, entry in hyperparameters().items():
-        others = "; ".join(f"{profile}: {_value(values[name])}" for profile, values in profiles().items() if name in values)
-        rows.append([f"`{name}`", entry.get("symbol", ""), _value(entry["value"]), others, entry["help"], entry["source"]])
+        others = "; ".join(
+            f"{profile}: {_value(values[name])}" for profile, values in profiles().items() if name in values
+        )
+        rows.append(
+            [f"`{name}`", entry.get("symbol", ""), _value(entry["value"]), others, entry["help"], entry["source"]]
+        )
     return markdown_table(["name", "symbol", "paper", "others, where they differ", "meaning", "source"], rows)
 
 
 def edition_list() -> str:
     """What each edition is."""
-    rows = [[f"`{edition.name}`", edition.title, edition.source, edition.date, f"`{edition.profile}`"] for edition in editions().values()]
+    rows = [
+        [f"`{edition.name}`", edition.title, edition.source, edition.date, f"`{edition.profile}`"]
+        for edition in editions().values()
+    ]
     return markdown_table(["edition", "what it is", "source", "date", "profile"], rows)
 
 
 def edition_table(chapter: str = "") -> str:
-    """The requirements that some edition has otherwise, of one chapter (`spec/07-returns.md`) or of all, and what holds in each."""
+    """The requirements that some edition has otherwise, of one chapter (`spec/07-returns.md`) or of all, and what holds
+    in each."""
     found = {name for edition in editions().values() for name in edition.differs}
     names = [name for name in requirements() if name in found and chapter in ("", chapter_of(name))]
     rows = [[name, *(_in_edition(edition, name) for edition in editions().values())] for name in names]
@@ -76,7 +84,9 @@ def _in_edition(edition: Edition, requirement: str) -> str:
     if (difference := edition.differs.get(requirement)) is None:
         return "holds"
     values = (f"`{name}` {_value(profiles()[edition.profile][name])}" for name in difference.settings)
-    return " ".join([difference.instead, *(["Not judged."] if not difference.is_modelled else []), ", ".join(values)]).strip()
+    return " ".join(
+        [difference.instead, *(["Not judged."] if not difference.is_modelled else []), ", ".join(values)]
+    ).strip()
 
 
 def chapters_with_editions() -> list[str]:
@@ -85,14 +95,21 @@ def chapters_with_editions() -> list[str]:
 
 def edition_beyond() -> str:
     """The functions that editions have otherwise, without a model."""
-    rows = [[f"`{edition.name}`", ", ".join(f"`{name}`" for name in edition.beyond)] for edition in editions().values() if edition.beyond]
+    rows = [
+        [f"`{edition.name}`", ", ".join(f"`{name}`" for name in edition.beyond)]
+        for edition in editions().values()
+        if edition.beyond
+    ]
     return markdown_table(["edition", "not modelled"], rows)
 
 
 def size_table() -> str:
     """Every size; what a size does not set has the default."""
     names = list(next(iter(sizes().values())))
-    rows = [[f"`{size}`", *(str(values.get(name, hyperparameters()[name]["value"])) for name in names)] for size, values in sizes().items()]
+    rows = [
+        [f"`{size}`", *(str(values.get(name, hyperparameters()[name]["value"])) for name in names)]
+        for size, values in sizes().items()
+    ]
     return markdown_table(["size", *(f"`{name}`" for name in names)], rows)
 
 
@@ -124,21 +141,37 @@ def conformance_summary() -> str:
         statuses = [entry["status"] for entry in report["checks"].values()]
         counts = [str(statuses.count(status)) for status in ("pass", "fail", "error", "not offered")]
         numbers = sum(entry["compared"] for entry in report["checks"].values())
-        name, worst = max(report["requirements"].items(), key=lambda item: math.inf if item[1]["share"] is None else item[1]["share"])
+        name, worst = max(
+            report["requirements"].items(), key=lambda item: math.inf if item[1]["share"] is None else item[1]["share"]
+        )
         share = "no number" if worst["share"] is None else f"{worst['share']:.0%}"
         rows.append([*key, *counts, f"{numbers:,}", f"{share} ({name})"])
     return markdown_table(
-        ["backend", "dtype", "edition", "pass", "fail", "error", "not offered", "numbers compared", "worst, of allowed"], rows
+        [
+            "backend",
+            "dtype",
+            "edition",
+            "pass",
+            "fail",
+            "error",
+            "not offered",
+            "numbers compared",
+            "worst, of allowed",
+        ],
+        rows,
     )
 
 
 def conformance_chapters() -> str:
-    """For each chapter the requirements of which all checks that are offered pass in float64, and the worst share of what is allowed."""
+    """For each chapter the requirements of which all checks that are offered pass in float64, and the worst share of
+    what is allowed."""
     runs = {key: report for key, report in conformance_runs().items() if key[1] == "float64"}
     prefixes = list(dict.fromkeys(name.split("-")[0] for report in runs.values() for name in report["requirements"]))
 
     def cell(report: dict[str, Any], prefix: str) -> str:
-        statuses = {name: summary.status(report, name) for name in report["requirements"] if name.split("-")[0] == prefix}
+        statuses = {
+            name: summary.status(report, name) for name in report["requirements"] if name.split("-")[0] == prefix
+        }
         offered = [name for name, status in statuses.items() if status != "not offered"]
         if not offered:
             return "not offered"
@@ -151,7 +184,8 @@ def conformance_chapters() -> str:
 
 
 def mutants() -> dict[str, dict[str, dict[str, Any]]]:
-    """The committed run of `conformance mutants --diagnose --json`: chapter -> mutant -> what it is, what caught it, what it was named."""
+    """The committed run of `conformance mutants --diagnose --json`: chapter -> mutant -> what it is, what caught it,
+    what it was named."""
     chapters: dict[str, dict[str, dict[str, Any]]] = {}
     for name, entry in json.loads((RESULTS / "mutants.json").read_text(encoding="utf-8"))["mutants"].items():
         chapters.setdefault(entry["chapter"], {})[name] = entry
@@ -171,7 +205,9 @@ def mutant_summary() -> str:
 
 def mutant_tables() -> str:
     """Every mutant: a table for each chapter."""
-    return "\n".join(f"### [{chapter}](../{chapter})\n\n{_mutants_of(entries)}" for chapter, entries in mutants().items())
+    return "\n".join(
+        f"### [{chapter}](../{chapter})\n\n{_mutants_of(entries)}" for chapter, entries in mutants().items()
+    )
 
 
 def _mutants_of(entries: dict[str, dict[str, Any]]) -> str:
@@ -180,7 +216,11 @@ def _mutants_of(entries: dict[str, dict[str, Any]]) -> str:
         killers = entry["deviates_in"] + entry["raises_in"]
         caught = f"{len(killers)}: `{killers[0]}`" if killers else "nothing"
         first = entry["diagnosis"][0] if entry["diagnosis"] else {"mutant": "nothing", "alternatives": []}
-        named = "itself" if is_named(name, entry["diagnosis"]) else ", ".join(f"`{n}`" for n in (first["mutant"], *first["alternatives"]))
+        named = (
+            "itself"
+            if is_named(name, entry["diagnosis"])
+            else ", ".join(f"`{n}`" for n in (first["mutant"], *first["alternatives"]))
+        )
         texts = [entry[part].replace("|", "\\|") for part in ("explanation", "provenance", "fix")]
         rows.append([f"`{name}`", *texts[:2], ", ".join(entry["violates"]), texts[2], caught, named])
     return markdown_table(["mutant", "mistake", "provenance", "violates", "fix", "caught by", "named"], rows)
@@ -206,7 +246,9 @@ def learning_table() -> str:
                 step, minutes, value = run["evaluation/return"][-1]
                 random, times = (f"{run['random']:.4g}", f"{value / run['random']:.1f}") if run["random"] else ("", "")
                 name = path.stem.removeprefix("learning-")
-                rows.append([name, run["backend"], str(run["seed"]), f"{step:,}", f"{minutes:.1f}", f"{value:g}", random, times])
+                rows.append(
+                    [name, run["backend"], str(run["seed"]), f"{step:,}", f"{minutes:.1f}", f"{value:g}", random, times]
+                )
     return markdown_table(["curve", "backend", "seed", "steps", "minutes", "return", "random policy", "ratio"], rows)
 
 
@@ -215,10 +257,26 @@ def replay_table(name: str) -> str:
     rows = []
     for entry in json.loads((RESULTS / f"replay-{name}.json").read_text(encoding="utf-8"))["results"]:
         counts = [entry[key] for key in ("records", "inserts_per_s", "batches_per_s")]
-        times = [f"{entry['write_back_ms']:.2g} ms", f"{entry['write_back_after_save_ms']:.2g} ms", f"{entry['save_s']:.2g} s"]
+        times = [
+            f"{entry['write_back_ms']:.2g} ms",
+            f"{entry['write_back_after_save_ms']:.2g} ms",
+            f"{entry['save_s']:.2g} s",
+        ]
         memory = [f"{entry[key]:,} MiB" for key in ("data_mib", "memory_limit_mib", "own_mib", "mapped_mib")]
         rows.append([entry["kind"], *(f"{count:,}" for count in counts), *times, *memory])
-    header = ["record", "stored", "inserts/s", "batches/s", "write-back", "after a save", "save", "data", "limit", "own memory", "mapped"]
+    header = [
+        "record",
+        "stored",
+        "inserts/s",
+        "batches/s",
+        "write-back",
+        "after a save",
+        "save",
+        "data",
+        "limit",
+        "own memory",
+        "mapped",
+    ]
     return markdown_table(header, rows)
 
 
@@ -226,17 +284,36 @@ def loop_shares() -> str:
     """The shares of a committed run of `benchmarks.loop`."""
     rows = []
     for entry in _loop()["shares"]:
-        numbers = [f"{entry['speed/steps']:.0f}", f"{entry['speed/train_steps']:.1f}", f"{entry['speed/learner_share']:.1%}"]
+        numbers = [
+            f"{entry['speed/steps']:.0f}",
+            f"{entry['speed/train_steps']:.1f}",
+            f"{entry['speed/learner_share']:.1%}",
+        ]
         parts = [f"{entry[f'time/{part}']:.1%}" for part in ("policy", "environments", "replay", "train", "other")]
         environment = {"Vectors": "no time", "SlowVectors": "20 ms a step"}[entry["environment"]]
         rows.append([entry["backend"], environment, *numbers, *parts])
-    header = ["backend", "environment", "steps/s", "train steps/s", "learner's share", "policy", "environments", "replay", "train", "other"]
+    header = [
+        "backend",
+        "environment",
+        "steps/s",
+        "train steps/s",
+        "learner's share",
+        "policy",
+        "environments",
+        "replay",
+        "train",
+        "other",
+    ]
     return markdown_table(header, rows)
 
 
 def loop_memory() -> str:
     """The memory of a committed run of `benchmarks.loop`."""
-    rows = [[entry["backend"], f"{step:,}", f"{size:.2f} GiB"] for entry in _loop()["memory"] for step, size in entry["points"]]
+    rows = [
+        [entry["backend"], f"{step:,}", f"{size:.2f} GiB"]
+        for entry in _loop()["memory"]
+        for step, size in entry["points"]
+    ]
     return markdown_table(["backend", "environment steps", "memory of the process"], rows)
 
 
@@ -254,13 +331,19 @@ def lockstep_table(mode: str, dtypes: tuple[str, ...]) -> str:
     """The worst deviation of each group in the first 100 steps, and after them."""
     columns: dict[str, dict[str, list[str]]] = {}
     for dtype in dtypes:
-        for problem, found in json.loads((RESULTS / f"lockstep-{dtype}.json").read_text(encoding="utf-8"))["problems"].items():
+        for problem, found in json.loads((RESULTS / f"lockstep-{dtype}.json").read_text(encoding="utf-8"))[
+            "problems"
+        ].items():
             early = sum(step <= 100 for step in found["steps"])
             for name, modes in found["comparisons"].items():
                 curves = modes[mode]["curves"].items()
-                columns[f"{name}, {dtype}, {problem}"] = {group: [_worst(curve[:early]), _worst(curve[early:])] for group, curve in curves}
+                columns[f"{name}, {dtype}, {problem}"] = {
+                    group: [_worst(curve[:early]), _worst(curve[early:])] for group, curve in curves
+                }
     groups = next(iter(columns.values()))
-    return markdown_table(["group", *columns], [[group, *(" / ".join(cells[group]) for cells in columns.values())] for group in groups])
+    return markdown_table(
+        ["group", *columns], [[group, *(" / ".join(cells[group]) for cells in columns.values())] for group in groups]
+    )
 
 
 def _worst(curve: list[float | None]) -> str:
@@ -275,7 +358,10 @@ TABLES: dict[str, Callable[[], str]] = {
     "editions": edition_list,
     "edition_differences": edition_table,
     "edition_beyond": edition_beyond,
-    **{f"editions of {Path(chapter).stem}": functools.partial(edition_table, chapter) for chapter in chapters_with_editions()},
+    **{
+        f"editions of {Path(chapter).stem}": functools.partial(edition_table, chapter)
+        for chapter in chapters_with_editions()
+    },
     "benchmarks": benchmark_table,
     "conformance_summary": conformance_summary,
     "conformance_chapters": conformance_chapters,
@@ -312,7 +398,11 @@ def documents() -> list[Path]:
 
 def stale() -> list[Path]:
     """The files whose generated parts differ from their sources."""
-    return [path for path in documents() if path.exists() and render(path.read_text(encoding="utf-8")) != path.read_text(encoding="utf-8")]
+    return [
+        path
+        for path in documents()
+        if path.exists() and render(path.read_text(encoding="utf-8")) != path.read_text(encoding="utf-8")
+    ]
 
 
 def main() -> int:

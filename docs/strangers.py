@@ -25,8 +25,11 @@ Data = dict[str, Any]
 
 
 def reduce(name: str, result: Data) -> Data:
-    """Of a result of the kit what is kept of a stranger. A message is kept up to its first line; of an error the last, the exception."""
-    offered = {check: entry for check, entry in result["checks"].items() if entry["status"] not in ("not offered", NOT_JUDGED)}
+    """Of a result of the kit what is kept of a stranger. A message is kept up to its first line; of an error the last,
+    the exception."""
+    offered = {
+        check: entry for check, entry in result["checks"].items() if entry["status"] not in ("not offered", NOT_JUDGED)
+    }
     statuses = [entry["status"] for entry in result["checks"].values()]
     return {
         "package": name,
@@ -81,11 +84,27 @@ def summary_table() -> str:
         package, failed = findings()[name], failing(result)
         kinds = [kind_of(package, check) for check in failed]
         extreme = sum(result["checks"][check]["extreme"] for check in failed)
-        counts = [len(result["checks"]), len(result["checks"]) - len(failed), extreme, *(kinds.count(kind) for kind in KINDS)]
+        counts = [
+            len(result["checks"]),
+            len(result["checks"]) - len(failed),
+            extreme,
+            *(kinds.count(kind) for kind in KINDS),
+        ]
         setting = f"{result['dtype']}, {result['edition']}"
-        rows.append([f"[{package['title']}]({package['url']})", result["version"], result["date"], setting, *map(str, counts)])
+        rows.append(
+            [f"[{package['title']}]({package['url']})", result["version"], result["date"], setting, *map(str, counts)]
+        )
     return _table(
-        ["package", "version", "checked on", "precision, edition", "checks judged", "passed", "fail at extremes only", *KINDS.values()],
+        [
+            "package",
+            "version",
+            "checked on",
+            "precision, edition",
+            "checks judged",
+            "passed",
+            "fail at extremes only",
+            *KINDS.values(),
+        ],
         rows,
     )
 
@@ -97,15 +116,28 @@ def finding_sections() -> str:
 
 def _section(package: Data, result: Data) -> str:
     failed = failing(result)
-    lines = [f"### {package['title']} {result['version']}", "", f"Offered: {package['offers']}", "", _passed_by_chapter(result)]
+    lines = [
+        f"### {package['title']} {result['version']}",
+        "",
+        f"Offered: {package['offers']}",
+        "",
+        _passed_by_chapter(result),
+    ]
     causes = [check for check in failed if "same" not in package[check]]
     for check in causes:
         finding = package[check]
         others = [other for other in failed if package[other].get("same") == check]
         names = ", ".join(f"`{name}`" for name in (check, *others))
-        requirements = ", ".join(sorted({id_ for name in (check, *others) for id_ in result["checks"][name]["requirements"]}))
+        requirements = ", ".join(
+            sorted({id_ for name in (check, *others) for id_ in result["checks"][name]["requirements"]})
+        )
         at = ", with extreme input only" if all(result["checks"][name]["extreme"] for name in (check, *others)) else ""
-        lines += ["", f"**{names}** ({requirements}): {KINDS[finding['kind']]}{at}.", "", f"> {result['checks'][check]['message']}"]
+        lines += [
+            "",
+            f"**{names}** ({requirements}): {KINDS[finding['kind']]}{at}.",
+            "",
+            f"> {result['checks'][check]['message']}",
+        ]
         lines += ["", finding["what"].strip(), "", f"Verified: {finding['verified'].strip()}"]
         if "script" in finding:
             lines += ["", "```python", finding["script"].strip(), "```"]
@@ -116,7 +148,10 @@ def _passed_by_chapter(result: Data) -> str:
     chapters: dict[str, list[bool]] = {}
     for entry in result["checks"].values():
         chapters.setdefault(chapter_of(entry["requirements"][0]), []).append(entry["status"] == "pass")
-    parts = (f"[{Path(chapter).stem}](../{chapter}) {sum(passed)} of {len(passed)}" for chapter, passed in sorted(chapters.items()))
+    parts = (
+        f"[{Path(chapter).stem}](../{chapter}) {sum(passed)} of {len(passed)}"
+        for chapter, passed in sorted(chapters.items())
+    )
     return f"Passed: {', '.join(parts)}."
 
 

@@ -23,7 +23,8 @@ State = dict[str, Any]
 
 
 def initial_parameters(table: Mapping[str, Parameter], uniforms: Mapping[str, ArrayLike]) -> dict[str, jax.Array]:
-    """Parameters from the table and a uniform number for each entry of each kernel, in the dtype of the uniforms. [AGT-3] to [AGT-6]"""
+    """Parameters from the table and a uniform number for each entry of each kernel, in the dtype of the uniforms.
+    [AGT-3] to [AGT-6]"""
     dtype = jnp.result_type(*(real(uniform) for uniform in uniforms.values()))
     params = {}
     for name, entry in table.items():
@@ -42,7 +43,9 @@ def initial_state(params: Params) -> State:
     dtype = jnp.result_type(*params.values())
     return {
         "params": dict(params),
-        "slow_critic": {name: jnp.array(value, copy=True) for name, value in params.items() if name.startswith("critic/")},
+        "slow_critic": {
+            name: jnp.array(value, copy=True) for name, value in params.items() if name.startswith("critic/")
+        },
         "optimizer": initial_optimizer_state(params),
         "return_range": {"low": jnp.zeros((), dtype), "high": jnp.zeros((), dtype)},
     }
@@ -96,7 +99,8 @@ def losses(
 
     Returns:
       total: scalar.
-      aux: "losses" (name -> unweighted mean), "return_range" (updated), "deter" [B, T, D] and "stoch" [B, T, S, C] (constants), "metrics".
+      aux: "losses" (name -> unweighted mean), "return_range" (updated), "deter" [B, T, D] and "stoch" [B, T, S, C]
+        (constants), "metrics".
     """
     _check_parameters(params, spaces, config)
     _check_parameters(slow_critic, spaces, config)
@@ -105,7 +109,9 @@ def losses(
     low, high = (stop_gradient(jnp.asarray(end)) for end in return_range)
     states = _observe_batch(params, batch, noise["posterior"], spaces, config)
     each = world_model_losses(params, batch, states, spaces, config)
-    behavior_losses, updated_range, metrics = _behavior_losses(params, slow_critic, (low, high), batch, states, noise, spaces, config)
+    behavior_losses, updated_range, metrics = _behavior_losses(
+        params, slow_critic, (low, high), batch, states, noise, spaces, config
+    )
     each |= behavior_losses
     means = {name: jnp.mean(loss) if loss.size else jnp.zeros((), loss.dtype) for name, loss in each.items()}
     total = jnp.asarray(sum(getattr(config, f"{name.split('/')[0]}_scale") * mean for name, mean in means.items()))
@@ -140,13 +146,19 @@ def _check_batch(batch: Arrays, noise: Arrays, spaces: Spaces, config: Config) -
     require_shape("batch stoch", batch["stoch"], B, config.stoch)
     _check_observations(batch, (B, T), spaces)
     H = config.imagination_horizon
-    shapes = {"posterior": (B, T, config.stoch), "prior": (B * T, H, config.stoch), "action": (B * T, H, spaces.action_noise_size)}
+    shapes = {
+        "posterior": (B, T, config.stoch),
+        "prior": (B * T, H, config.stoch),
+        "action": (B * T, H, spaces.action_noise_size),
+    }
     for key, shape in shapes.items():
         require(key in noise, "noise", f"the key {key!r}", f"the keys {sorted(noise)}")
         require_shape(f"noise {key}", noise[key], *shape)
 
 
-def _observe_batch(params: Params, batch: Arrays, uniform: jax.Array, spaces: Spaces, config: Config) -> dict[str, jax.Array]:
+def _observe_batch(
+    params: Params, batch: Arrays, uniform: jax.Array, spaces: Spaces, config: Config
+) -> dict[str, jax.Array]:
     """The posterior states of a train batch, from the stored latents of the context step. [AGT-14], [AGT-15]"""
     tokens = networks.encoder(params, batch, spaces, config)
     carry = {"deter": batch["deter"], "stoch": jax.nn.one_hot(batch["stoch"], config.classes, dtype=jnp.float32)}
@@ -163,7 +175,8 @@ def _behavior_losses(
     spaces: Spaces,
     config: Config,
 ) -> tuple[dict[str, jax.Array], tuple[jax.Array, jax.Array], dict[str, jax.Array]]:
-    """Losses of actor and critic, the updated return range, and metrics; imagined arrays have time first. [AGT-17] to [AGT-25]"""
+    """Losses of actor and critic, the updated return range, and metrics; imagined arrays have time first. [AGT-17] to
+    [AGT-25]"""
     B, T = batch["is_first"].shape
     exact, bins = exact_dtype(config), exponential_bins(config.bins)
     constants = stop_gradient(dict(params))
@@ -197,11 +210,15 @@ def _behavior_losses(
     if T > 1:
         flags = (batch["is_last"], batch["is_terminal"])
         reward_seen = batch["reward"].astype(exact)
-        replayed = returns.replay_lambda_return(reward_seen, *flags, target[0].reshape(B, T), config.discount, config.return_lambda)
+        replayed = returns.replay_lambda_return(
+            reward_seen, *flags, target[0].reshape(B, T), config.discount, config.return_lambda
+        )
         live = networks.critic(params, feature, config)
         # Imagination starts at the posterior states, so the slow critic has judged them already.
         slow = slow_logits[0].reshape(B, T, -1)
-        each["replay_critic"] = behavior.replay_critic_loss(live[:, :-1], slow[:, :-1], replayed, batch["is_last"][:, :-1], config)
+        each["replay_critic"] = behavior.replay_critic_loss(
+            live[:, :-1], slow[:, :-1], replayed, batch["is_last"][:, :-1], config
+        )
     metrics = {
         "return_scale": scale,
         "return_mean": jnp.mean(imagined),
@@ -214,14 +231,18 @@ def _behavior_losses(
     return each, updated_range, metrics
 
 
-def _imagine_batch(constants: Params, states: Arrays, noise: Arrays, spaces: Spaces, config: Config) -> tuple[jax.Array, jax.Array]:
+def _imagine_batch(
+    constants: Params, states: Arrays, noise: Arrays, spaces: Spaces, config: Config
+) -> tuple[jax.Array, jax.Array]:
     """Features [H+1, N, F] and actions [H, N, A] of imagination from every posterior state. [AGT-17], [AGT-18]"""
     N = states["deter"].shape[0] * states["deter"].shape[1]
     carry = stop_gradient({key: states[key].reshape(N, *states[key].shape[2:]) for key in ("deter", "stoch")})
     uniform, action_noise = (noise[key].swapaxes(0, 1) for key in ("prior", "action"))
 
     def policy(feature: jax.Array, t: jax.Array) -> jax.Array:
-        return behavior.sample_action(networks.actor(constants, feature, spaces, config), action_noise[t], spaces, config)
+        return behavior.sample_action(
+            networks.actor(constants, feature, spaces, config), action_noise[t], spaces, config
+        )
 
     return rssm.imagine_features(constants, carry, policy, uniform, config)
 
@@ -244,8 +265,11 @@ def gradients(
     return by_name, loss, aux
 
 
-def train_step(state: State, batch: Arrays, noise: Arrays, spaces: Spaces, config: Config) -> tuple[State, dict[str, Any]]:
-    """One gradient step: (new state, aux of `losses` with the optimizer's metrics beside the others). [AGT-29] to [AGT-31]
+def train_step(
+    state: State, batch: Arrays, noise: Arrays, spaces: Spaces, config: Config
+) -> tuple[State, dict[str, Any]]:
+    """One gradient step: (new state, aux of `losses` with the optimizer's metrics beside the others). [AGT-29] to
+    [AGT-31]
 
     The returned latents are those of the parameters before the update.
     """
@@ -259,4 +283,6 @@ def train_step(state: State, batch: Arrays, noise: Arrays, spaces: Spaces, confi
         "optimizer": optimizer,
         "return_range": {"low": low, "high": high},
     }
-    return new, aux | {"metrics": aux["metrics"] | metrics | {"loss/total": loss, "return_low": low, "return_high": high}}
+    return new, aux | {
+        "metrics": aux["metrics"] | metrics | {"loss/total": loss, "return_low": low, "return_high": high}
+    }

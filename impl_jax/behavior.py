@@ -1,7 +1,7 @@
 """Actor and critic: actions, their log-probability and entropy, and the three losses. Chapter: spec/08-behavior.md.
 
-The losses are elementwise and not weighted by their scales [BEH-17]; they accept any leading axes in place of [N, H], so that training can
-keep time first.
+The losses are elementwise and not weighted by their scales [BEH-17]; they accept any leading axes in place of [N, H],
+so that training can keep time first.
 """
 
 import functools
@@ -34,7 +34,9 @@ Outputs = Mapping[str, Mapping[str, jax.Array]]
 
 def _check_outputs(outputs: Outputs, spaces: Spaces) -> tuple[int, ...]:
     """The leading axes of the actor's outputs, after checking keys and shapes. [BEH-23]"""
-    require(set(outputs) == set(spaces.actions), "outputs", f"the action keys {list(spaces.actions)}", f"{sorted(outputs)}")
+    require(
+        set(outputs) == set(spaces.actions), "outputs", f"the action keys {list(spaces.actions)}", f"{sorted(outputs)}"
+    )
     leading: tuple[int, ...] | None = None
     for key, space in spaces.actions.items():
         parts = ("logits",) if isinstance(space, Discrete) else ("mean", "std")
@@ -99,7 +101,9 @@ def _distributions(outputs: Outputs, spaces: Spaces, config: Config) -> Iterator
                 start += classes
         else:
             mean, std = outputs[key]["mean"], outputs[key]["std"]
-            yield _Normals(*bounded_normal(mean, std, config.actor_min_std, config.actor_max_std), space.size, space.size)
+            yield _Normals(
+                *bounded_normal(mean, std, config.actor_min_std, config.actor_max_std), space.size, space.size
+            )
 
 
 def sample_action(outputs: Outputs, noise: jax.Array, spaces: Spaces, config: Config) -> jax.Array:
@@ -120,7 +124,8 @@ def mode_action(outputs: Outputs, spaces: Spaces, config: Config) -> jax.Array:
 
 
 def action_log_prob(outputs: Outputs, action: jax.Array, spaces: Spaces, config: Config) -> jax.Array:
-    """The log-probability of a raw flat action [..., A], a constant, summed over everything: [...], nats. [BEH-5], [BEH-6]"""
+    """The log-probability of a raw flat action [..., A], a constant, summed over everything: [...], nats. [BEH-5],
+    [BEH-6]"""
     leading = _check_outputs(outputs, spaces)
     require_shape("action", action, *leading, spaces.action_size)
     total, start = [], 0
@@ -154,28 +159,38 @@ def actor_loss(
 
 
 def _value_loss(logits: jax.Array, slow_logits: jax.Array, returns: jax.Array, config: Config) -> jax.Array:
-    """Cross-entropy with the return, and with the mean of the slow critic as a target of its own. Section "Critic learning"."""
+    """Cross-entropy with the return, and with the mean of the slow critic as a target of its own. Section "Critic
+    learning"."""
     require_shape("logits", logits, *returns.shape, config.bins)
     require_same_shape(logits=logits, slow_logits=slow_logits)
     bins = exponential_bins(config.bins)
     slow_mean = stop_gradient(symexp_twohot_mean(slow_logits, bins))
-    return symexp_twohot_loss(logits, returns, bins) + config.slow_critic_scale * symexp_twohot_loss(logits, slow_mean, bins)
+    return symexp_twohot_loss(logits, returns, bins) + config.slow_critic_scale * symexp_twohot_loss(
+        logits, slow_mean, bins
+    )
 
 
-def critic_loss(logits: jax.Array, slow_logits: jax.Array, returns: jax.Array, weight: jax.Array, config: Config) -> jax.Array:
+def critic_loss(
+    logits: jax.Array, slow_logits: jax.Array, returns: jax.Array, weight: jax.Array, config: Config
+) -> jax.Array:
     """The critic's loss in imagination: [N, H, bins] twice and [N, H] twice -> [N, H]. [BEH-12], [BEH-13]"""
     require_same_shape(returns=returns, weight=weight)
     return stop_gradient(real(weight)) * _value_loss(logits, slow_logits, returns, config)
 
 
-def replay_critic_loss(logits: jax.Array, slow_logits: jax.Array, returns: jax.Array, is_last: jax.Array, config: Config) -> jax.Array:
-    """The critic's loss on replayed steps 0 .. T-2: [B, T-1, bins] twice and [B, T-1] twice -> [B, T-1]. [BEH-14], [BEH-15]"""
+def replay_critic_loss(
+    logits: jax.Array, slow_logits: jax.Array, returns: jax.Array, is_last: jax.Array, config: Config
+) -> jax.Array:
+    """The critic's loss on replayed steps 0 .. T-2: [B, T-1, bins] twice and [B, T-1] twice -> [B, T-1]. [BEH-14],
+    [BEH-15]"""
     require_same_shape(returns=returns, is_last=is_last)
     loss = _value_loss(logits, slow_logits, returns, config)
     return (1.0 - jnp.asarray(is_last).astype(loss.dtype)) * loss
 
 
-def update_slow_critic(slow: Mapping[str, jax.Array], critic: Mapping[str, jax.Array], decay: float) -> dict[str, jax.Array]:
+def update_slow_critic(
+    slow: Mapping[str, jax.Array], critic: Mapping[str, jax.Array], decay: float
+) -> dict[str, jax.Array]:
     """decay * slow + (1 - decay) * critic for every name of the slow critic, in its precision. [BEH-19], [BEH-20]
 
     Raises:
@@ -185,4 +200,7 @@ def update_slow_critic(slow: Mapping[str, jax.Array], critic: Mapping[str, jax.A
     require(set(slow) == names, "slow", f"the names {sorted(names)}", f"{sorted(slow)}")
     for name in slow:
         require_shape(f"critic {name}", critic[name], *slow[name].shape)
-    return {name: (decay * value + (1.0 - decay) * critic[name].astype(value.dtype)).astype(value.dtype) for name, value in slow.items()}
+    return {
+        name: (decay * value + (1.0 - decay) * critic[name].astype(value.dtype)).astype(value.dtype)
+        for name, value in slow.items()
+    }

@@ -1,8 +1,9 @@
 """The three convolutions without bias, each with hand-written gradients. The layers of chapter 03 are in layers.py.
 
-On accelerators they are the compiler's own. On the CPU those reach a quarter of the matrix rate, and less in the gradients, so there a few
-images at a time are unfolded into a matrix of patches that stays in the cache and is multiplied with the kernel; the gradients are arranged
-so that each of them is again such a product, without the zeros that a dilated convolution would multiply.
+On accelerators they are the compiler's own. On the CPU those reach a quarter of the matrix rate, and less in the
+gradients, so there a few images at a time are unfolded into a matrix of patches that stays in the cache and is
+multiplied with the kernel; the gradients are arranged so that each of them is again such a product, without the zeros
+that a dilated convolution would multiply.
 """
 
 import functools
@@ -34,7 +35,8 @@ def depth_to_space(x: jax.Array) -> jax.Array:
 
 
 def doubling_kernel(kernel: jax.Array) -> jax.Array:
-    """The kernel [5, 5, in, out] of a transposed convolution as [3, 3, in, (2, 2, out)], for a convolution before `depth_to_space`.
+    """The kernel [5, 5, in, out] of a transposed convolution as [3, 3, in, (2, 2, out)], for a convolution before
+    `depth_to_space`.
 
     Output 2i + a reads input i + q through tap a + 1 - 2q: three inputs, of which one tap may not exist.
     """
@@ -44,9 +46,11 @@ def doubling_kernel(kernel: jax.Array) -> jax.Array:
 
 
 def upsampling_kernel(kernel: jax.Array) -> jax.Array:
-    """As `doubling_kernel`, for nearest-neighbour upsampling followed by a convolution [5, 5, in, out]: taps on the same pixel add up.
+    """As `doubling_kernel`, for nearest-neighbour upsampling followed by a convolution [5, 5, in, out]: taps on the
+    same pixel add up.
 
-    Output 2i + a reads input i + q through the taps 2q + b + 2 - a for b = 0, 1: nine products for each output instead of twenty-five.
+    Output 2i + a reads input i + q through the taps 2q + b + 2 - a for b = 0, 1: nine products for each output instead
+    of twenty-five.
     """
 
     def fold(taps: jax.Array, axis: int) -> jax.Array:
@@ -76,7 +80,9 @@ def _patches(x: jax.Array, size: int, stride: int) -> jax.Array:
         x = jnp.concatenate([shift(x, column, 2, columns) for column in range(size)], -1)
         x = jnp.concatenate([shift(x, row, 1, rows) for row in range(size)], -1)
     else:
-        x = jnp.concatenate([shift(shift(x, row, 1, rows), column, 2, columns) for row in range(size) for column in range(size)], -1)
+        x = jnp.concatenate(
+            [shift(shift(x, row, 1, rows), column, 2, columns) for row in range(size) for column in range(size)], -1
+        )
     return x.reshape(n * rows * columns, size * size * channels)
 
 
@@ -145,7 +151,13 @@ def _double_cpu(x: jax.Array, kernel: jax.Array) -> jax.Array:
 def _double_native(x: jax.Array, kernel: jax.Array) -> jax.Array:
     padding = [(3, 2), (3, 2)]
     return lax.conv_general_dilated(
-        x, kernel[::-1, ::-1], (1, 1), padding, lhs_dilation=(2, 2), dimension_numbers=_NHWC, precision=precision(x.dtype)
+        x,
+        kernel[::-1, ::-1],
+        (1, 1),
+        padding,
+        lhs_dilation=(2, 2),
+        dimension_numbers=_NHWC,
+        precision=precision(x.dtype),
     )
 
 
@@ -163,7 +175,9 @@ def _kernel_gradient_cpu(x: jax.Array, g: jax.Array, size: int, stride: int) -> 
 
     def add(total: jax.Array, pair: tuple[jax.Array, ...]) -> tuple[jax.Array, None]:
         patches, g = _patches(pair[0], size, stride), pair[1].reshape(-1, outputs)
-        product = lax.dot_general(patches, g, (((0,), (0,)), ((), ())), precision=precision(x.dtype), preferred_element_type=dtype)
+        product = lax.dot_general(
+            patches, g, (((0,), (0,)), ((), ())), precision=precision(x.dtype), preferred_element_type=dtype
+        )
         return total + product, None
 
     split = tuple(a.reshape(images // chunk, chunk, *a.shape[1:]) for a in (x, g))
@@ -186,8 +200,11 @@ def _kernel_gradient_native(x: jax.Array, g: jax.Array, size: int, stride: int) 
 
 
 def _kernel_gradient(x: jax.Array, g: jax.Array, size: int, stride: int) -> jax.Array:
-    """d loss / d kernel [size, size, in, out] of a convolution from x to an output whose gradient is g, in float32 or better."""
-    cpu, native = (functools.partial(f, size=size, stride=stride) for f in (_kernel_gradient_cpu, _kernel_gradient_native))
+    """d loss / d kernel [size, size, in, out] of a convolution from x to an output whose gradient is g, in float32 or
+    better."""
+    cpu, native = (
+        functools.partial(f, size=size, stride=stride) for f in (_kernel_gradient_cpu, _kernel_gradient_native)
+    )
     return lax.platform_dependent(x, g, cpu=cpu, default=native)
 
 
@@ -199,7 +216,9 @@ def same(x: jax.Array, kernel: jax.Array) -> jax.Array:
 
 def _same_bwd(saved: tuple[jax.Array, jax.Array], g: jax.Array) -> tuple[jax.Array, jax.Array]:
     x, kernel = saved
-    return _correlate(g, kernel[::-1, ::-1].swapaxes(2, 3), 1), _kernel_gradient(x, g, kernel.shape[0], 1).astype(kernel.dtype)
+    return _correlate(g, kernel[::-1, ::-1].swapaxes(2, 3), 1), _kernel_gradient(x, g, kernel.shape[0], 1).astype(
+        kernel.dtype
+    )
 
 
 same.defvjp(lambda x, kernel: (same(x, kernel), (x, kernel)), _same_bwd)

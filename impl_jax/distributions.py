@@ -1,4 +1,5 @@
-"""What the outputs of the networks mean: how to sample from them and how to score them. Chapter: spec/02-distributions.md.
+"""What the outputs of the networks mean: how to sample from them and how to score them. Chapter:
+spec/02-distributions.md.
 
 Every function computes in float32, or in float64 for a float64 first argument. [DIS-1]
 """
@@ -21,11 +22,14 @@ def _constant(x: ArrayLike, like: jax.Array) -> jax.Array:
 
 def _leading(name: str, array: jax.Array, reference: jax.Array) -> None:
     """Raises ValueError unless an array has the leading axes of a categorical. [DIS-3]"""
-    require(array.shape == reference.shape[:-1], name, f"shape {list(reference.shape[:-1])}", f"shape {list(array.shape)}")
+    require(
+        array.shape == reference.shape[:-1], name, f"shape {list(reference.shape[:-1])}", f"shape {list(array.shape)}"
+    )
 
 
 def _weighted_sum(weights: jax.Array, logarithms: jax.Array) -> jax.Array:
-    """The sum of weight times logarithm over the last axis, where a weight of 0 silences even an infinite logarithm. [DIS-4]
+    """The sum of weight times logarithm over the last axis, where a weight of 0 silences even an infinite logarithm.
+    [DIS-4]
 
     The logarithm is replaced before it is multiplied: afterwards its gradient would be NaN already.
     """
@@ -44,13 +48,14 @@ def unimix_log_probs(logits: ArrayLike, unimix: float) -> jax.Array:
 
 
 def categorical_sample(log_probs: ArrayLike, uniform: ArrayLike) -> jax.Array:
-    """One-hot samples by inverse CDF, one uniform number each: [..., C], [...] -> [..., C], constant. [DIS-8], [CON-17]"""
+    """One-hot samples by inverse CDF, one uniform number each: [..., C], [...] -> [..., C], constant. [DIS-8],
+    [CON-17]"""
     log_probs = stop_gradient(real(log_probs))
     uniform = _constant(uniform, log_probs)
     _leading("uniform", uniform, log_probs)
     classes = log_probs.shape[-1]
-    # Running sums as a product with a triangle of ones: faster than a scan over a few classes, and a class of probability 0 has
-    # exactly the running sum of the class before it, so that it is never drawn.
+    # Running sums as a product with a triangle of ones: faster than a scan over a few classes, and a class of
+    # probability 0 has exactly the running sum of the class before it, so that it is never drawn.
     triangle = jnp.triu(jnp.ones((classes, classes - 1), log_probs.dtype))
     cumulative = jnp.matmul(jnp.exp(log_probs), triangle, precision=jax.lax.Precision.HIGHEST)
     index = jnp.sum(cumulative <= uniform[..., None], axis=-1)
@@ -58,7 +63,8 @@ def categorical_sample(log_probs: ArrayLike, uniform: ArrayLike) -> jax.Array:
 
 
 def straight_through(log_probs: ArrayLike, sample: ArrayLike) -> jax.Array:
-    """The value of the sample with the gradient of the probabilities: [..., C]. Section "World model learning". [DIS-9]"""
+    """The value of the sample with the gradient of the probabilities: [..., C]. Section "World model learning".
+    [DIS-9]"""
     log_probs = real(log_probs)
     sample = _constant(sample, log_probs)
     require_same_shape(log_probs=log_probs, sample=sample)
@@ -101,11 +107,12 @@ def symexp_twohot_loss(logits: ArrayLike, target: ArrayLike, bins: ArrayLike) ->
 
 
 def symexp_twohot_mean(logits: ArrayLike, bins: ArrayLike) -> jax.Array:
-    """The mean of the softmax over the bins: [..., K] -> [...], in units of the bins, exactly 0 for mirror-symmetric logits. [DIS-15]"""
+    """The mean of the softmax over the bins: [..., K] -> [...], in units of the bins, exactly 0 for mirror-symmetric
+    logits. [DIS-15]"""
     logits = real(logits)
     weights = jnp.exp(logits - stop_gradient(jnp.max(logits, axis=-1, keepdims=True)))
-    # The division comes last: on the CPU, XLA divides some elements of a row by another route than their mirror images, and the last bit of
-    # a weight times the outermost bin is as large as a reward.
+    # The division comes last: on the CPU, XLA divides some elements of a row by another route than their mirror images,
+    # and the last bit of a weight times the outermost bin is as large as a reward.
     return ordered_expectation(weights, bins) / jnp.sum(weights, axis=-1)
 
 

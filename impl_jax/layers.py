@@ -1,7 +1,7 @@
 """The parts that networks are built from. Chapter: spec/03-layers.md.
 
-Parameters keep their own precision; every function converts them to the dtype of `x`, which the caller has put into the compute dtype, and
-returns that dtype. [LAY-1]
+Parameters keep their own precision; every function converts them to the dtype of `x`, which the caller has put into the
+compute dtype, and returns that dtype. [LAY-1]
 """
 
 import functools
@@ -37,20 +37,27 @@ def exact_dtype(config: Config) -> jnp.dtype:
 
 @jax.custom_vjp
 def product(x: jax.Array, kernel: jax.Array) -> jax.Array:
-    """[..., in] x [in, out] -> [..., out], in the dtype of x; the gradient of the kernel in the dtype of the kernel. [CON-23]"""
-    return lax.dot_general(x, kernel.astype(x.dtype), (((x.ndim - 1,), (0,)), ((), ())), precision=convolutions.precision(x.dtype))
+    """[..., in] x [in, out] -> [..., out], in the dtype of x; the gradient of the kernel in the dtype of the kernel.
+    [CON-23]"""
+    return lax.dot_general(
+        x, kernel.astype(x.dtype), (((x.ndim - 1,), (0,)), ((), ())), precision=convolutions.precision(x.dtype)
+    )
 
 
 def _product_bwd(saved: tuple[jax.Array, jax.Array], g: jax.Array) -> tuple[jax.Array, jax.Array]:
     x, kernel = saved
-    dx = lax.dot_general(g, kernel.astype(x.dtype), (((g.ndim - 1,), (1,)), ((), ())), precision=convolutions.precision(x.dtype))
+    dx = lax.dot_general(
+        g, kernel.astype(x.dtype), (((g.ndim - 1,), (1,)), ((), ())), precision=convolutions.precision(x.dtype)
+    )
     return dx, product_kernel_gradient(x, g, kernel.dtype)
 
 
 def product_kernel_gradient(x: jax.Array, g: jax.Array, dtype: jnp.dtype) -> jax.Array:
     """[..., in], [..., out] -> [in, out], summed over the leading axes."""
     axes = tuple(range(x.ndim - 1))
-    return lax.dot_general(x, g, ((axes, axes), ((), ())), precision=convolutions.precision(x.dtype), preferred_element_type=dtype)
+    return lax.dot_general(
+        x, g, ((axes, axes), ((), ())), precision=convolutions.precision(x.dtype), preferred_element_type=dtype
+    )
 
 
 product.defvjp(lambda x, kernel: (product(x, kernel), (x, kernel)), _product_bwd)
@@ -59,12 +66,16 @@ product.defvjp(lambda x, kernel: (product(x, kernel), (x, kernel)), _product_bwd
 @jax.custom_vjp
 def block_product(x: jax.Array, kernel: jax.Array) -> jax.Array:
     """One product for each block: [G, n, in/G] x [G, in/G, out/G] -> [G, n, out/G]."""
-    return lax.dot_general(x, kernel.astype(x.dtype), (((2,), (1,)), ((0,), (0,))), precision=convolutions.precision(x.dtype))
+    return lax.dot_general(
+        x, kernel.astype(x.dtype), (((2,), (1,)), ((0,), (0,))), precision=convolutions.precision(x.dtype)
+    )
 
 
 def _block_product_bwd(saved: tuple[jax.Array, jax.Array], g: jax.Array) -> tuple[jax.Array, jax.Array]:
     x, kernel = saved
-    dx = lax.dot_general(g, kernel.astype(x.dtype), (((2,), (2,)), ((0,), (0,))), precision=convolutions.precision(x.dtype))
+    dx = lax.dot_general(
+        g, kernel.astype(x.dtype), (((2,), (2,)), ((0,), (0,))), precision=convolutions.precision(x.dtype)
+    )
     return dx, block_kernel_gradient(x, g, kernel.dtype)
 
 
@@ -78,9 +89,12 @@ block_product.defvjp(lambda x, kernel: (block_product(x, kernel), (x, kernel)), 
 
 
 def column_sum(x: jax.Array, dtype: jnp.dtype) -> jax.Array:
-    """[n, c] -> [c], as a product with ones: on the CPU several times as fast as the compiler's sum over rows, and as exact."""
+    """[n, c] -> [c], as a product with ones: on the CPU several times as fast as the compiler's sum over rows, and as
+    exact."""
     ones = jnp.ones((1, x.shape[0]), x.dtype)
-    return lax.dot_general(ones, x, (((1,), (0,)), ((), ())), precision=convolutions.precision(x.dtype), preferred_element_type=dtype)[0]
+    return lax.dot_general(
+        ones, x, (((1,), (0,)), ((), ())), precision=convolutions.precision(x.dtype), preferred_element_type=dtype
+    )[0]
 
 
 @jax.custom_vjp
@@ -113,23 +127,35 @@ def from_blocks(x: jax.Array) -> jax.Array:
 def linear(x: jax.Array, kernel: jax.Array, bias: jax.Array) -> jax.Array:
     """[..., in] -> [..., out] with kernel [in, out] and bias [out]. [LAY-2]"""
     require(kernel.ndim == 2, "kernel", "2 axes [in, out]", f"shape {list(kernel.shape)}")
-    require(x.ndim >= 1 and x.shape[-1] == kernel.shape[0], "x", f"a last axis of {kernel.shape[0]}", f"shape {list(x.shape)}")
+    require(
+        x.ndim >= 1 and x.shape[-1] == kernel.shape[0],
+        "x",
+        f"a last axis of {kernel.shape[0]}",
+        f"shape {list(x.shape)}",
+    )
     require_shape("bias", bias, kernel.shape[1])
     return add_bias(product(x, kernel), bias)
 
 
 def block_linear(x: jax.Array, kernel: jax.Array, bias: jax.Array) -> jax.Array:
-    """[..., in] -> [..., out] with kernel [G, in/G, out/G] and bias [out]: each contiguous piece of x by itself. [LAY-3]"""
+    """[..., in] -> [..., out] with kernel [G, in/G, out/G] and bias [out]: each contiguous piece of x by itself.
+    [LAY-3]"""
     require(kernel.ndim == 3, "kernel", "3 axes [G, in/G, out/G]", f"shape {list(kernel.shape)}")
     blocks, inputs, outputs = kernel.shape
-    require(x.ndim >= 1 and x.shape[-1] == blocks * inputs, "x", f"a last axis of {blocks * inputs}", f"shape {list(x.shape)}")
+    require(
+        x.ndim >= 1 and x.shape[-1] == blocks * inputs,
+        "x",
+        f"a last axis of {blocks * inputs}",
+        f"shape {list(x.shape)}",
+    )
     require_shape("bias", bias, blocks * outputs)
     rows = to_blocks(x.reshape(-1, x.shape[-1]), blocks)
     return add_bias(from_blocks(block_product(rows, kernel)).reshape(*x.shape[:-1], -1), bias)
 
 
 def rms_norm(x: jax.Array, scale: jax.Array, epsilon: float) -> jax.Array:
-    """x / sqrt(mean(x^2) + epsilon) * scale over the last axis, in float32 or better, rounded once at the end. [LAY-4]"""
+    """x / sqrt(mean(x^2) + epsilon) * scale over the last axis, in float32 or better, rounded once at the end.
+    [LAY-4]"""
     require_shape("scale", scale, x.shape[-1])
     return rms_norm_over(x, scale, epsilon, (-1,))
 
@@ -138,7 +164,8 @@ def rms_norm_over(x: jax.Array, scale: jax.Array, epsilon: float, axes: tuple[in
     """`rms_norm` over several axes, with a scale that broadcasts."""
     wide = real(x)
     count = math.prod(x.shape[axis] for axis in axes)
-    # The factor goes in before the square, so that the sum of many large squares cannot overflow where their mean does not.
+    # The factor goes in before the square, so that the sum of many large squares cannot overflow where their mean does
+    # not.
     mean_square = jnp.sum(jnp.square(wide * count**-0.5), axis=axes, keepdims=True)
     return (wide * lax.rsqrt(mean_square + epsilon) * _rounded(scale, x.dtype)).astype(x.dtype)
 
@@ -146,7 +173,8 @@ def rms_norm_over(x: jax.Array, scale: jax.Array, epsilon: float, axes: tuple[in
 def _rounded(scale: jax.Array, dtype: jnp.dtype) -> jax.Array:
     """A scale in float32 or better, with the digits that it has in `dtype`. [LAY-1]
 
-    Its gradient is not rounded [CON-23]. A conversion to `dtype` and back would round it, and compilers may leave such a pair out.
+    Its gradient is not rounded [CON-23]. A conversion to `dtype` and back would round it, and compilers may leave such
+    a pair out.
     """
     wide = scale.astype(jnp.promote_types(dtype, jnp.float32))
     if wide.dtype == dtype:
@@ -223,7 +251,8 @@ def transposed_convolution(x: jax.Array, kernel: jax.Array, bias: jax.Array) -> 
 
 
 def upsampled_convolution(x: jax.Array, kernel: jax.Array, bias: jax.Array) -> jax.Array:
-    """convolution(upsample(x), kernel, bias, 1) without the upsampled image: [..., H, W, in] -> [..., 2H, 2W, out]. [LAY-14]"""
+    """convolution(upsample(x), kernel, bias, 1) without the upsampled image: [..., H, W, in] -> [..., 2H, 2W, out].
+    [LAY-14]"""
     y = convolutions.same(_images(x, kernel, bias), convolutions.upsampling_kernel(kernel))
     y = convolutions.depth_to_space(y)
     return add_bias(y.reshape(*x.shape[:-3], *y.shape[1:]), bias)
@@ -231,7 +260,12 @@ def upsampled_convolution(x: jax.Array, kernel: jax.Array, bias: jax.Array) -> j
 
 def _images(x: jax.Array, kernel: jax.Array, bias: jax.Array) -> jax.Array:
     """x with its leading axes as one, after the checks of [LAY-15]."""
-    require(kernel.ndim == 4 and kernel.shape[:2] == (5, 5), "kernel", "shape [5, 5, in, out]", f"shape {list(kernel.shape)}")
+    require(
+        kernel.ndim == 4 and kernel.shape[:2] == (5, 5),
+        "kernel",
+        "shape [5, 5, in, out]",
+        f"shape {list(kernel.shape)}",
+    )
     require(x.ndim >= 3, "x", "at least 3 axes [H, W, in]", f"shape {list(x.shape)}")
     require(x.shape[-1] == kernel.shape[2], "x", f"a last axis of {kernel.shape[2]}", f"shape {list(x.shape)}")
     require_shape("bias", bias, kernel.shape[3])
@@ -239,7 +273,8 @@ def _images(x: jax.Array, kernel: jax.Array, bias: jax.Array) -> jax.Array:
 
 
 def max_pool(x: jax.Array) -> jax.Array:
-    """The maximum of each 2 x 2 window: [..., H, W, C] -> [..., H/2, W/2, C]; its gradient goes to the first maximum. [LAY-12]"""
+    """The maximum of each 2 x 2 window: [..., H, W, C] -> [..., H/2, W/2, C]; its gradient goes to the first maximum.
+    [LAY-12]"""
     require(x.ndim >= 3, "x", "at least 3 axes [H, W, C]", f"shape {list(x.shape)}")
     *leading, height, width, channels = x.shape
     require(not (height % 2 or width % 2), "x", "even sides", f"shape {list(x.shape)}")
@@ -274,7 +309,8 @@ def mlp(params: Params, name: str, x: jax.Array, layers: int, epsilon: float) ->
 
 
 def truncated_normal(uniform: ArrayLike, fan_in: int, outscale: float) -> jax.Array:
-    """Initial weights from uniforms, of their shape and dtype, with standard deviation outscale / sqrt(fan_in). [LAY-9], [LAY-11]"""
+    """Initial weights from uniforms, of their shape and dtype, with standard deviation outscale / sqrt(fan_in).
+    [LAY-9], [LAY-11]"""
     require(fan_in >= 1, "fan_in", "at least 1", fan_in)
     uniform = real(uniform)
     normal = math.sqrt(2) * lax.erf_inv((2.0 * uniform - 1.0) * math.erf(math.sqrt(2)))

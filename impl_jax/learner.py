@@ -25,10 +25,12 @@ class Learner:
     """An agent on one device.
 
     seed: of the initial parameters. device: see `select_device`. nonfinite: "stop" or "skip", [LOOP-40] to [LOOP-42].
-    threads: that compute on the CPU, in the whole process; counts only before JAX has begun to use a device. None leaves them as they are.
+    threads: that compute on the CPU, in the whole process; counts only before JAX has begun to use a device. None
+    leaves them as they are.
 
     Raises:
-      ValueError: an unknown device, or one that this installation of JAX does not have, or another word for `nonfinite`.
+      ValueError: an unknown device, or one that this installation of JAX does not have, or another word for
+        `nonfinite`.
     """
 
     def __init__(
@@ -46,7 +48,9 @@ class Learner:
             jax.config.update("jax_enable_x64", True)
         self.spaces, self.config, self._nonfinite = spaces, config, nonfinite
         if threads:
-            os.environ["NPROC"] = str(threads)  # XLA has no other way to say it; it looks when it makes the client of the CPU.
+            os.environ["NPROC"] = str(
+                threads
+            )  # XLA has no other way to say it; it looks when it makes the client of the CPU.
         self._device = select_device(device)
         self.device = ":".join([self._device.platform, *(device or "").split(":")[1:]])
         with jax.default_device(self._device):
@@ -57,7 +61,16 @@ class Learner:
         self._train = jax.jit(self._train_function, donate_argnums=0)
         self._gradients = jax.jit(self._gradients_function)
         self._predict = jax.jit(self._predict_function, static_argnums=4)
-        self._batch_keys = (*spaces.observations, "reward", "is_first", "is_last", "is_terminal", "prev_action", "deter", "stoch")
+        self._batch_keys = (
+            *spaces.observations,
+            "reward",
+            "is_first",
+            "is_last",
+            "is_terminal",
+            "prev_action",
+            "deter",
+            "stoch",
+        )
 
     def initial_carry(self, envs: int) -> Any:
         """The carry of `envs` environments before their first step. [CON-5]"""
@@ -69,12 +82,17 @@ class Learner:
 
     def save_carry(self, carry: Any) -> dict[str, np.ndarray]:
         """A carry as arrays, exactly: what is bfloat16 becomes float32."""
-        return {key: np.asarray(value.astype(jnp.float32) if value.dtype == jnp.bfloat16 else value) for key, value in carry.items()}
+        return {
+            key: np.asarray(value.astype(jnp.float32) if value.dtype == jnp.bfloat16 else value)
+            for key, value in carry.items()
+        }
 
     def load_carry(self, arrays: Arrays) -> Any:
         """The inverse of `save_carry`. [CON-5]"""
         zeros = self.initial_carry(len(arrays["action"]))
-        return jax.device_put({key: jnp.asarray(arrays[key], value.dtype) for key, value in zeros.items()}, self._device)
+        return jax.device_put(
+            {key: jnp.asarray(arrays[key], value.dtype) for key, value in zeros.items()}, self._device
+        )
 
     def memory(self) -> int | None:
         """Bytes in use on the accelerator; None without one."""
@@ -86,9 +104,9 @@ class Learner:
     ) -> tuple[np.ndarray, Arrays, Any]:
         """One acting step of N environments. [AGT-11]
 
-        observation: key -> [N, ...]; is_first [N]; seed: of the random numbers; mode: the action is the mode of the actor,
-        [LOOP-71]. Returns the flat action [N, A], the latents
-        {"deter" [N, D], "stoch" [N, S] class indices}, which may still be computing, and the new carry.
+        observation: key -> [N, ...]; is_first [N]; seed: of the random numbers; mode: the action is the mode of the
+        actor, [LOOP-71]. Returns the flat action [N, A], the latents {"deter" [N, D], "stoch" [N, S] class indices},
+        which may still be computing, and the new carry.
         """
         inputs = {key: np.asarray(observation[key]) for key in self.spaces.observations if key in observation}
         inputs = jax.device_put((inputs, np.asarray(is_first, bool)), self._device)
@@ -107,18 +125,23 @@ class Learner:
         return {name: _Element(metrics.values, index) for index, name in enumerate(metrics.names)}, latents
 
     def gradients(self, batch: Arrays, seed: int) -> tuple[dict[str, float], dict[str, np.ndarray]]:
-        """The metrics and the gradient of every parameter that a train step would compute now. Changes nothing. [LOOP-44]"""
+        """The metrics and the gradient of every parameter that a train step would compute now. Changes nothing.
+        [LOOP-44]"""
         metrics, gradients = self._gradients(self._state, self._inputs(batch), np.uint32(seed))
         numbers = dict(zip(metrics.names, np.asarray(metrics.values).tolist(), strict=True))
         return numbers, {name: np.array(gradient) for name, gradient in gradients.items()}
 
-    def predict(self, observation: Arrays, prev_action: np.ndarray, is_first: np.ndarray, context: int, seed: int) -> dict[str, np.ndarray]:
+    def predict(
+        self, observation: Arrays, prev_action: np.ndarray, is_first: np.ndarray, context: int, seed: int
+    ) -> dict[str, np.ndarray]:
         """The open-loop prediction of recorded sequences, with the random numbers of a seed. [WM-20] to [WM-24]
 
         observation: key -> [B, T, ...]; prev_action [B, T, A]; is_first [B, T].
         """
         inputs = {key: np.asarray(observation[key]) for key in self.spaces.observations if key in observation}
-        inputs, prev_action, is_first = jax.device_put((inputs, np.asarray(prev_action), np.asarray(is_first, bool)), self._device)
+        inputs, prev_action, is_first = jax.device_put(
+            (inputs, np.asarray(prev_action), np.asarray(is_first, bool)), self._device
+        )
         predictions = self._predict(self._state["params"], inputs, prev_action, is_first, context, np.uint32(seed))
         return {key: np.asarray(value) for key, value in predictions.items()}
 
@@ -143,7 +166,9 @@ class Learner:
             if name in state and np.shape(state[name]) != shape
         ]
         if problems:
-            raise ValueError("this training state does not fit the configuration and spaces:\n  " + "\n  ".join(problems))
+            raise ValueError(
+                "this training state does not fit the configuration and spaces:\n  " + "\n  ".join(problems)
+            )
         # Copies, because the next train step reuses the memory of the state.
         new = {name: np.array(state[name], value.dtype) for name, value in current.items()}
         self._state = jax.device_put(_unflatten(new), self._device)
@@ -164,10 +189,14 @@ class Learner:
         shape = is_first.shape
         noise = _noise(seed, {"posterior": (*shape, self.config.stoch)}, shape, self.spaces, self.config)
         latents = {"deter": carry["deter"], "stoch": carry["stoch"]}
-        latents, action = agent.policy_step(params, latents, carry["action"], observation, is_first, noise, self.spaces, self.config, mode)
+        latents, action = agent.policy_step(
+            params, latents, carry["action"], observation, is_first, noise, self.spaces, self.config, mode
+        )
         return latents | {"action": action}, self._stored(latents)
 
-    def _train_function(self, state: Any, stopped: jax.Array, batch: Any, seed: jax.Array) -> tuple[Any, jax.Array, Any, Any]:
+    def _train_function(
+        self, state: Any, stopped: jax.Array, batch: Any, seed: jax.Array
+    ) -> tuple[Any, jax.Array, Any, Any]:
         new, aux = agent.train_step(state, batch, self._train_noise(batch, seed), self.spaces, self.config)
         metrics = {f"loss/{name}": mean for name, mean in aux["losses"].items()} | aux["metrics"]
         finite = jnp.isfinite(metrics["loss/total"]) & jnp.isfinite(metrics["gradient_norm"])
@@ -179,7 +208,9 @@ class Learner:
     def _gradients_function(self, state: Any, batch: Any, seed: jax.Array) -> tuple[Any, dict[str, jax.Array]]:
         return_range = (state["return_range"]["low"], state["return_range"]["high"])
         noise = self._train_noise(batch, seed)
-        gradients, total, aux = agent.gradients(state["params"], state["slow_critic"], return_range, batch, noise, self.spaces, self.config)
+        gradients, total, aux = agent.gradients(
+            state["params"], state["slow_critic"], return_range, batch, noise, self.spaces, self.config
+        )
         low, high = aux["return_range"]
         metrics = {f"loss/{name}": mean for name, mean in aux["losses"].items()} | aux["metrics"]
         metrics |= {"loss/total": total, "return_low": low, "return_high": high}
@@ -194,20 +225,33 @@ class Learner:
         return _noise(seed, uniforms, (N, H), self.spaces, self.config)
 
     def _packed(self, metrics: Mapping[str, jax.Array]) -> "_Metrics":
-        return _Metrics(tuple(metrics), jnp.stack([value.astype(exact_dtype(self.config)) for value in metrics.values()]))
+        return _Metrics(
+            tuple(metrics), jnp.stack([value.astype(exact_dtype(self.config)) for value in metrics.values()])
+        )
 
     def _predict_function(
         self, params: Any, observation: Any, prev_action: jax.Array, is_first: jax.Array, context: int, seed: jax.Array
     ) -> dict[str, jax.Array]:
         (B, T), key = is_first.shape, jax.random.key(seed)
-        shapes = {"posterior": (B, max(0, context), self.config.stoch), "prior": (B, max(0, T - context), self.config.stoch)}
+        shapes = {
+            "posterior": (B, max(0, context), self.config.stoch),
+            "prior": (B, max(0, T - context), self.config.stoch),
+        }
         dtype = exact_dtype(self.config)
-        noise = {name: jax.random.uniform(jax.random.fold_in(key, i), shape, dtype) for i, (name, shape) in enumerate(shapes.items())}
-        return world_model.open_loop(params, observation, prev_action, is_first, context, noise, self.spaces, self.config)
+        noise = {
+            name: jax.random.uniform(jax.random.fold_in(key, i), shape, dtype)
+            for i, (name, shape) in enumerate(shapes.items())
+        }
+        return world_model.open_loop(
+            params, observation, prev_action, is_first, context, noise, self.spaces, self.config
+        )
 
     def _stored(self, states: Any) -> dict[str, jax.Array]:
         """Latents as the replay buffer keeps them."""
-        return {"deter": states["deter"].astype(jnp.float32), "stoch": jnp.argmax(states["stoch"], -1).astype(jnp.int32)}
+        return {
+            "deter": states["deter"].astype(jnp.float32),
+            "stoch": jnp.argmax(states["stoch"], -1).astype(jnp.int32),
+        }
 
 
 @functools.partial(jax.tree_util.register_dataclass, data_fields=["values"], meta_fields=["names"])
@@ -253,7 +297,9 @@ def select_device(name: str | None) -> jax.Device:
     try:
         devices = jax.devices(match[1] or match[2])
     except RuntimeError as error:
-        raise ValueError(f"JAX finds no device {name!r} here, only {jax.default_backend()!r}; install jax[cuda12] for a GPU") from error
+        raise ValueError(
+            f"JAX finds no device {name!r} here, only {jax.default_backend()!r}; install jax[cuda12] for a GPU"
+        ) from error
     index = int(match[3] or 0)
     if index >= len(devices):
         raise ValueError(f"JAX finds no device {name!r} here: there are {len(devices)} GPUs, counted from 0")
@@ -274,9 +320,13 @@ def _initial_state(seed: jax.Array, static: _Static) -> dict[str, Any]:
 def _noise(
     seed: jax.Array, uniforms: Mapping[str, tuple[int, ...]], leading: tuple[int, ...], spaces: Spaces, config: Config
 ) -> dict[str, jax.Array]:
-    """Uniforms of the given shapes, and "action" [*leading, K]: normals for vectors, uniforms for categoricals. [CON-19] to [CON-21]"""
+    """Uniforms of the given shapes, and "action" [*leading, K]: normals for vectors, uniforms for categoricals.
+    [CON-19] to [CON-21]"""
     key, dtype = jax.random.key(seed), exact_dtype(config)
-    noise = {name: jax.random.uniform(jax.random.fold_in(key, i), shape, dtype) for i, (name, shape) in enumerate(uniforms.items())}
+    noise = {
+        name: jax.random.uniform(jax.random.fold_in(key, i), shape, dtype)
+        for i, (name, shape) in enumerate(uniforms.items())
+    }
     parts = []
     for index, space in enumerate(spaces.actions.values(), len(uniforms)):
         draw = jax.random.uniform if isinstance(space, Discrete) else jax.random.normal
@@ -294,7 +344,12 @@ def _flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, jax.Array]:
 
 def _unflatten(flat: Mapping[str, np.ndarray]) -> dict[str, Any]:
     """The training state from its canonical names: parameter names keep their slashes. [AGT-9]"""
-    state: dict[str, Any] = {"params": {}, "slow_critic": {}, "optimizer": {"second_moment": {}, "momentum": {}}, "return_range": {}}
+    state: dict[str, Any] = {
+        "params": {},
+        "slow_critic": {},
+        "optimizer": {"second_moment": {}, "momentum": {}},
+        "return_range": {},
+    }
     for name, value in flat.items():
         group, rest = name.split("/", 1)
         if group == "optimizer" and rest != "step":

@@ -37,7 +37,8 @@ def feature(deter: jax.Array, stoch: jax.Array) -> jax.Array:
 
 
 def encoder(params: Params, observations: Observations, spaces: Spaces, config: Config) -> jax.Array:
-    """Raw observations [..., *array_shape] -> tokens [..., E]: vector features, then flat image features. [NET-2] to [NET-12]
+    """Raw observations [..., *array_shape] -> tokens [..., E]: vector features, then flat image features. [NET-2] to
+    [NET-12]
 
     Raises:
       ValueError: a missing key, or an observation of the wrong shape or dtype. [NET-27]
@@ -47,8 +48,12 @@ def encoder(params: Params, observations: Observations, spaces: Spaces, config: 
         bottleneck(config, spaces)  # refuses sides that cannot be halved, before any network runs
     tokens = []
     if spaces.vectors:
-        x = jnp.concatenate([_vector_input(observations[key], space, config) for key, space in spaces.vectors.items()], -1)
-        tokens.append(mlp(params, "encoder/vector", x.astype(compute_dtype(config)), config.encoder_layers, config.norm_epsilon))
+        x = jnp.concatenate(
+            [_vector_input(observations[key], space, config) for key, space in spaces.vectors.items()], -1
+        )
+        tokens.append(
+            mlp(params, "encoder/vector", x.astype(compute_dtype(config)), config.encoder_layers, config.norm_epsilon)
+        )
     if spaces.images:
         x = jnp.concatenate([observations[key] for key in spaces.images], -1).astype(exact_dtype(config))
         x = (x / 255.0 - 0.5).astype(compute_dtype(config))
@@ -76,7 +81,9 @@ def _leading_axes(observations: Observations, spaces: Spaces) -> tuple[int, ...]
 
 def onehots(x: jax.Array, space: Discrete, dtype: jnp.dtype) -> jax.Array:
     """Class indices [..., len(classes)] as joined one-hots [..., sum(classes)]. [CON-26]"""
-    return jnp.concatenate([jax.nn.one_hot(x[..., entry], classes, dtype=dtype) for entry, classes in enumerate(space.classes)], -1)
+    return jnp.concatenate(
+        [jax.nn.one_hot(x[..., entry], classes, dtype=dtype) for entry, classes in enumerate(space.classes)], -1
+    )
 
 
 def _vector_input(x: jax.Array, space: Vector | Discrete, config: Config) -> jax.Array:
@@ -102,7 +109,8 @@ def _image_encoder(params: Params, x: jax.Array, config: Config) -> jax.Array:
 
 
 def decoder(params: Params, feature: jax.Array, spaces: Spaces, config: Config) -> dict[str, jax.Array]:
-    """Reconstructions from features [..., F]: key -> symlog vectors, logits, or images in [0, 1]. [NET-13] to [NET-19]"""
+    """Reconstructions from features [..., F]: key -> symlog vectors, logits, or images in [0, 1]. [NET-13] to
+    [NET-19]"""
     x = _feature_input(feature, config)
     result: dict[str, jax.Array] = {}
     if spaces.vectors:
@@ -124,16 +132,22 @@ def _image_decoder(params: Params, x: jax.Array, spaces: Spaces, config: Config)
     deter, stoch = x[:, : config.deter], x[:, config.deter :]
 
     from_deter = block_linear(deter, params["decoder/image/deter/kernel"], params["decoder/image/deter/bias"])
-    from_deter = from_deter.reshape(-1, config.blocks, height, width, from_deter.shape[-1] // (config.blocks * height * width))
+    from_deter = from_deter.reshape(
+        -1, config.blocks, height, width, from_deter.shape[-1] // (config.blocks * height * width)
+    )
     from_deter = from_deter.transpose(0, 2, 3, 1, 4).reshape(-1, height, width, config.blocks * from_deter.shape[-1])
     hidden = dense(params, "decoder/image/stoch_hidden", stoch, config.norm_epsilon)
-    from_stoch = linear(hidden, params["decoder/image/stoch/kernel"], params["decoder/image/stoch/bias"]).reshape(from_deter.shape)
+    from_stoch = linear(hidden, params["decoder/image/stoch/kernel"], params["decoder/image/stoch/bias"]).reshape(
+        from_deter.shape
+    )
     y = activate(from_deter + from_stoch, params["decoder/image/stem/scale"], config.norm_epsilon)
 
     double = transposed_convolution if config.cnn_sampling == "strided" else upsampled_convolution
     for index in range(len(config.cnn_multipliers) - 1):
         name = f"decoder/image/conv{index}"
-        y = activate(double(y, params[f"{name}/kernel"], params[f"{name}/bias"]), params[f"{name}/scale"], config.norm_epsilon)
+        y = activate(
+            double(y, params[f"{name}/kernel"], params[f"{name}/bias"]), params[f"{name}/scale"], config.norm_epsilon
+        )
     kernel, bias = params["decoder/image/out/kernel"], params["decoder/image/out/bias"]
     y = convolution(y, kernel, bias, 1) if config.cnn_outer else double(y, kernel, bias)
     return jax.nn.sigmoid(y.astype(exact_dtype(config)))
@@ -165,7 +179,8 @@ def continue_head(params: Params, feature: jax.Array, config: Config) -> jax.Arr
 
 
 def critic(params: Params, feature: jax.Array, config: Config) -> jax.Array:
-    """Features [..., F] -> logits [..., bins] of the symexp-twohot value; also with the slow critic's parameters. [NET-20], [NET-23]"""
+    """Features [..., F] -> logits [..., bins] of the symexp-twohot value; also with the slow critic's parameters.
+    [NET-20], [NET-23]"""
     return _head(params, "critic", feature, config.critic_layers, config)
 
 

@@ -1,7 +1,7 @@
 """Adaptive gradient clipping and LaProp. Chapter: spec/09-optimizer.md.
 
-The plain functions of the chapter work on one tensor. `adaptive_gradient_clipping` and `scale_by_laprop` are the same as ordinary optax
-transformations over any tree of parameters, for use on their own:
+The plain functions of the chapter work on one tensor. `adaptive_gradient_clipping` and `scale_by_laprop` are the same
+as ordinary optax transformations over any tree of parameters, for use on their own:
 
     optax.chain(adaptive_gradient_clipping(0.3), scale_by_laprop(), optax.scale_by_learning_rate(4e-5))
 """
@@ -26,7 +26,8 @@ _DEAD_ZONE = 1e-16  # gradients below it count as zero: their squares would leav
 
 
 def norm(x: ArrayLike) -> jax.Array:
-    """The root of the sum of squares over all entries, which neither overflows nor vanishes because the squares do. [OPT-3]"""
+    """The root of the sum of squares over all entries, which neither overflows nor vanishes because the squares do.
+    [OPT-3]"""
     x = real(x)
     peak = jnp.max(jnp.abs(x))
     return peak * jnp.sqrt(jnp.sum(jnp.square(x / jnp.where(peak == 0, 1.0, peak))))
@@ -42,7 +43,8 @@ def _clip_factor(gradient: jax.Array, parameter: jax.Array, clip: float, epsilon
 
 
 def adaptive_gradient_clip(gradient: ArrayLike, parameter: ArrayLike, clip: float, epsilon: float) -> jax.Array:
-    """The gradient, not longer than clip * max(epsilon, norm of its parameter): [...], [...] -> [...]. [OPT-1] to [OPT-5]"""
+    """The gradient, not longer than clip * max(epsilon, norm of its parameter): [...], [...] -> [...]. [OPT-1] to
+    [OPT-5]"""
     gradient, parameter = real(gradient), real(parameter)
     require_same_shape(gradient=gradient, parameter=parameter)
     return gradient * _clip_factor(gradient, parameter, clip, epsilon)[0]
@@ -72,7 +74,13 @@ def _check_betas(beta1: float, beta2: float) -> None:
 
 
 def _laprop(
-    gradient: jax.Array, second_moment: jax.Array, momentum: jax.Array, step: ArrayLike, beta1: float, beta2: float, epsilon: float
+    gradient: jax.Array,
+    second_moment: jax.Array,
+    momentum: jax.Array,
+    step: ArrayLike,
+    beta1: float,
+    beta2: float,
+    epsilon: float,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     _check_betas(beta1, beta2)
     gradient = jnp.where(jnp.abs(gradient) < _DEAD_ZONE, 0.0, gradient)
@@ -86,7 +94,8 @@ def _laprop(
 def laprop(
     gradient: ArrayLike, second_moment: ArrayLike, momentum: ArrayLike, step: ArrayLike, config: Config
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """(update, second moment, momentum) of one tensor; the update without learning rate and minus sign. [OPT-8] to [OPT-14]
+    """(update, second moment, momentum) of one tensor; the update without learning rate and minus sign. [OPT-8] to
+    [OPT-14]
 
     Raises:
       ValueError: a beta of 1, or shapes that differ.
@@ -100,7 +109,8 @@ def laprop(
 def optimizer_step(
     params: Arrays, gradients: Arrays, state: Mapping[str, Any], config: Config
 ) -> tuple[dict[str, jax.Array], dict[str, Any]]:
-    """One update of every tensor: (params, state), the state being {"step", "second_moment", "momentum"}. [OPT-15] to [OPT-20]
+    """One update of every tensor: (params, state), the state being {"step", "second_moment", "momentum"}. [OPT-15] to
+    [OPT-20]
 
     Raises:
       ValueError: names or shapes that differ.
@@ -120,7 +130,9 @@ def optimizer_step_with_metrics(
     for name, parameter in params.items():
         factor, length = _clip_factor(gradients[name], parameter, config.agc_clip, config.agc_epsilon)
         moments = state["second_moment"][name], state["momentum"][name]
-        update, new["second_moment"][name], new["momentum"][name] = laprop(gradients[name] * factor, *moments, step, config)
+        update, new["second_moment"][name], new["momentum"][name] = laprop(
+            gradients[name] * factor, *moments, step, config
+        )
         new["params"][name] = parameter - rate * update
         lengths.append(length)
         moves.append(jnp.sum(jnp.square(update)))
@@ -130,12 +142,20 @@ def optimizer_step_with_metrics(
         "update_norm": jnp.sqrt(jnp.sum(jnp.stack(moves))) * rate,
         "clip_fraction": jnp.mean((jnp.stack(factors) < 1).astype(jnp.float32)),
     }
-    return new["params"], {"step": step + 1, "second_moment": new["second_moment"], "momentum": new["momentum"]}, metrics
+    return (
+        new["params"],
+        {"step": step + 1, "second_moment": new["second_moment"], "momentum": new["momentum"]},
+        metrics,
+    )
 
 
 def _check_names(params: Arrays, gradients: Arrays, state: Mapping[str, Any]) -> None:
     """[OPT-18]"""
-    for kind, arrays in (("gradients", gradients), ("second_moment", state["second_moment"]), ("momentum", state["momentum"])):
+    for kind, arrays in (
+        ("gradients", gradients),
+        ("second_moment", state["second_moment"]),
+        ("momentum", state["momentum"]),
+    ):
         different = sorted(set(params) ^ set(arrays))
         require(not different, kind, "the names of the parameters", f"a difference in {different}")
         for name, parameter in params.items():
@@ -144,7 +164,10 @@ def _check_names(params: Arrays, gradients: Arrays, state: Mapping[str, Any]) ->
 
 def initial_optimizer_state(params: Arrays) -> dict[str, Any]:
     """Zeros of the parameters' shapes and step 0. [OPT-13]"""
-    zeros = {kind: {name: jnp.zeros_like(parameter) for name, parameter in params.items()} for kind in ("second_moment", "momentum")}
+    zeros = {
+        kind: {name: jnp.zeros_like(parameter) for name, parameter in params.items()}
+        for kind in ("second_moment", "momentum")
+    }
     return {"step": jnp.zeros((), jnp.int32), **zeros}
 
 
@@ -154,9 +177,13 @@ def adaptive_gradient_clipping(clip: float, epsilon: float = 1e-3) -> optax.Grad
     Unlike `optax.adaptive_grad_clip` it compares whole tensors, not units.
     """
 
-    def update(updates: optax.Updates, state: optax.OptState, params: optax.Params | None = None) -> tuple[optax.Updates, optax.OptState]:
+    def update(
+        updates: optax.Updates, state: optax.OptState, params: optax.Params | None = None
+    ) -> tuple[optax.Updates, optax.OptState]:
         require(params is not None, "params", "the parameters, to compare the gradients with", None)
-        return jax.tree.map(lambda g, p: adaptive_gradient_clip(g, p, clip, epsilon).astype(g.dtype), updates, params), state
+        return jax.tree.map(
+            lambda g, p: adaptive_gradient_clip(g, p, clip, epsilon).astype(g.dtype), updates, params
+        ), state
 
     return optax.GradientTransformation(lambda params: optax.EmptyState(), update)
 
@@ -183,12 +210,19 @@ def scale_by_laprop(beta1: float = 0.9, beta2: float = 0.99, epsilon: float = 1e
 
         return LaPropState(jnp.zeros((), jnp.int32), zeros(), zeros())
 
-    def update(updates: optax.Updates, state: LaPropState, params: optax.Params | None = None) -> tuple[optax.Updates, LaPropState]:
+    def update(
+        updates: optax.Updates, state: LaPropState, params: optax.Params | None = None
+    ) -> tuple[optax.Updates, LaPropState]:
         gradients = jax.tree.map(real, updates)
         results = jax.tree.map(
-            lambda g, v, m: _laprop(g, v, m, state.step, beta1, beta2, epsilon), gradients, state.second_moment, state.momentum
+            lambda g, v, m: _laprop(g, v, m, state.step, beta1, beta2, epsilon),
+            gradients,
+            state.second_moment,
+            state.momentum,
         )
-        scaled, second_moment, momentum = jax.tree.transpose(jax.tree.structure(updates), jax.tree.structure((0, 0, 0)), results)
+        scaled, second_moment, momentum = jax.tree.transpose(
+            jax.tree.structure(updates), jax.tree.structure((0, 0, 0)), results
+        )
         scaled = jax.tree.map(lambda update, like: update.astype(like.dtype), scaled, updates)
         return scaled, LaPropState(state.step + 1, second_moment, momentum)
 

@@ -1,6 +1,7 @@
 """Returns: imagined and replayed lambda-returns, weights, and the range of the returns. Chapter: spec/07-returns.md.
 
-Everything is float32 or better and a constant of the train step; who uses a result makes it constant. [RET-17], [RET-18]
+Everything is float32 or better and a constant of the train step; who uses a result makes it constant. [RET-17],
+[RET-18]
 """
 
 import math
@@ -24,7 +25,8 @@ def _trajectories(least: int, **arrays: jax.Array) -> None:
 
 
 def _backward(target: jax.Array, factor: jax.Array, last: jax.Array) -> jax.Array:
-    """R_t = target_t + factor_t R_{t+1} backwards in time, where R after the end is `last`: [N, n], [N, n], [N] -> [N, n]."""
+    """R_t = target_t + factor_t R_{t+1} backwards in time, where R after the end is `last`: [N, n], [N, n], [N] -> [N,
+    n]."""
 
     def step(later: jax.Array, now: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         result = now[0] + now[1] * later
@@ -33,8 +35,11 @@ def _backward(target: jax.Array, factor: jax.Array, last: jax.Array) -> jax.Arra
     return lax.scan(step, last, (target.T, factor.T), reverse=True)[1].T
 
 
-def lambda_return(reward: jax.Array, continue_: jax.Array, value: jax.Array, discount: float, lambda_: float) -> jax.Array:
-    """Imagined returns: three [N, H+1] -> [N, H]; every quantity has the index of arrival. Section "Critic learning". [RET-1], [RET-2]"""
+def lambda_return(
+    reward: jax.Array, continue_: jax.Array, value: jax.Array, discount: float, lambda_: float
+) -> jax.Array:
+    """Imagined returns: three [N, H+1] -> [N, H]; every quantity has the index of arrival. Section "Critic learning".
+    [RET-1], [RET-2]"""
     reward = real(reward)
     continue_, value = (jnp.asarray(x).astype(reward.dtype) for x in (continue_, value))
     _trajectories(2, reward=reward, continue_=continue_, value=value)
@@ -43,7 +48,12 @@ def lambda_return(reward: jax.Array, continue_: jax.Array, value: jax.Array, dis
 
 
 def replay_lambda_return(
-    reward: jax.Array, is_last: jax.Array, is_terminal: jax.Array, annotation: jax.Array, discount: float, lambda_: float
+    reward: jax.Array,
+    is_last: jax.Array,
+    is_terminal: jax.Array,
+    annotation: jax.Array,
+    discount: float,
+    lambda_: float,
 ) -> jax.Array:
     """Returns along replayed sequences: four [B, T] -> [B, T-1]. Section "Critic learning". [RET-9], [RET-10]
 
@@ -58,7 +68,8 @@ def replay_lambda_return(
 
 
 def cumulative_weights(continue_: jax.Array, discount: float) -> jax.Array:
-    """How far each imagined state counts: [N, H+1] -> [N, H], the product of discount * continue up to it, over discount. [RET-7]
+    """How far each imagined state counts: [N, H+1] -> [N, H], the product of discount * continue up to it, over
+    discount. [RET-7]
 
     Raises:
       ValueError: a discount that is not above 0 and at most 1. [RET-8]
@@ -87,8 +98,11 @@ def percentile(values: jax.Array, q: float) -> jax.Array:
     return jnp.where(jnp.isnan(ordered[-1]), ordered[-1], result)
 
 
-def update_return_range(low: ArrayLike, high: ArrayLike, returns: jax.Array, config: Config) -> tuple[jax.Array, jax.Array]:
-    """The moving averages of both percentiles after the returns [N, H] of this step. Section "Actor learning". [RET-14], [RET-15]"""
+def update_return_range(
+    low: ArrayLike, high: ArrayLike, returns: jax.Array, config: Config
+) -> tuple[jax.Array, jax.Array]:
+    """The moving averages of both percentiles after the returns [N, H] of this step. Section "Actor learning".
+    [RET-14], [RET-15]"""
     decay = config.return_decay
     returns = real(returns)
 

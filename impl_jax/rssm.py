@@ -1,8 +1,9 @@
 """The recurrent state-space model: the core, posterior and prior, observing and imagining. Chapter: spec/04-rssm.md.
 
-Inside the time loops the recurrent state is kept block-major, [G, N, D/G], so that each block is a matrix product of its own; the part of
-the hidden layer's input that all blocks share is one dense product with the regrouped kernel rows. What does not depend on the recurrent
-state (the action embedding and the tokens' share of the posterior's first layer) is computed before the loop, in one batch.
+Inside the time loops the recurrent state is kept block-major, [G, N, D/G], so that each block is a matrix product of
+its own; the part of the hidden layer's input that all blocks share is one dense product with the regrouped kernel rows.
+What does not depend on the recurrent state (the action embedding and the tokens' share of the posterior's first layer)
+is computed before the loop, in one batch.
 """
 
 import functools
@@ -47,7 +48,8 @@ _CORE = ("embed_deter", "embed_stoch", "hidden_block", "hidden_shared", "gru")
 def _loop_weights(params: Params, names: tuple[str, ...], config: Config) -> tuple[Arrays, Arrays]:
     """Kernels and biases of the layers of a loop, by short name, in the arrangement that the loop multiplies with.
 
-    `rssm/hidden` becomes `hidden_block` [G, D/G, D/G], for the block's own part of h, and `hidden_shared` [3d, D], for what all share.
+    `rssm/hidden` becomes `hidden_block` [G, D/G, D/G], for the block's own part of h, and `hidden_shared` [3d, D], for
+    what all share.
     """
     size = config.deter // config.blocks
     kernels, biases = {}, {}
@@ -81,11 +83,14 @@ def _embed_action(params: Params, action: jax.Array, config: Config) -> jax.Arra
     return dense(params, "rssm/embed_action", action, config.norm_epsilon)
 
 
-def _core_step(apply: Apply, scales: Arrays, deter: jax.Array, stoch: jax.Array, action: jax.Array, config: Config) -> jax.Array:
+def _core_step(
+    apply: Apply, scales: Arrays, deter: jax.Array, stoch: jax.Array, action: jax.Array, config: Config
+) -> jax.Array:
     """deter [G, N, D/G], flat stoch [N, S*C], embedded action [N, d] -> deter [G, N, D/G]. [RSSM-3] to [RSSM-7]"""
     epsilon = config.norm_epsilon
     embedded = [
-        activate(apply(name, x), scales[name], epsilon) for name, x in (("embed_deter", from_blocks(deter)), ("embed_stoch", stoch))
+        activate(apply(name, x), scales[name], epsilon)
+        for name, x in (("embed_deter", from_blocks(deter)), ("embed_stoch", stoch))
     ]
     shared = apply("hidden_shared", jnp.concatenate([*embedded, action], -1))
     hidden = apply("hidden_block", deter) + to_blocks(shared, config.blocks)
@@ -101,7 +106,8 @@ def _core_scales(params: Params) -> Arrays:
 
 
 def core(params: Params, deter: jax.Array, stoch: jax.Array, action: jax.Array, config: Config) -> jax.Array:
-    """The memory update: deter [..., D], stoch [..., S, C], action [..., A] -> deter [..., D]. Section "Networks". [RSSM-1] to [RSSM-7]
+    """The memory update: deter [..., D], stoch [..., S, C], action [..., A] -> deter [..., D]. Section "Networks".
+    [RSSM-1] to [RSSM-7]
 
     Raises:
       ValueError: a shape that does not fit. [RSSM-27]
@@ -114,7 +120,9 @@ def core(params: Params, deter: jax.Array, stoch: jax.Array, action: jax.Array, 
     apply = _plain_apply(*_loop_weights(params, _CORE, config))
     rows = to_blocks(deter.astype(dtype).reshape(-1, config.deter), config.blocks)
     flat = stoch.astype(dtype).reshape(-1, config.stoch * config.classes)
-    return from_blocks(_core_step(apply, _core_scales(params), rows, flat, embedded, config)).reshape(*leading, config.deter)
+    return from_blocks(_core_step(apply, _core_scales(params), rows, flat, embedded, config)).reshape(
+        *leading, config.deter
+    )
 
 
 def prior(params: Params, deter: jax.Array, config: Config) -> jax.Array:
@@ -125,7 +133,8 @@ def prior(params: Params, deter: jax.Array, config: Config) -> jax.Array:
 
 
 def posterior(params: Params, deter: jax.Array, tokens: jax.Array, config: Config) -> jax.Array:
-    """Logits of the posterior: deter [..., D], tokens [..., E] -> [..., S, C], float32 or better. [RSSM-9], [RSSM-10]"""
+    """Logits of the posterior: deter [..., D], tokens [..., E] -> [..., S, C], float32 or better. [RSSM-9],
+    [RSSM-10]"""
     require_trailing("deter", deter, config.deter)
     require_shape("tokens", tokens, *deter.shape[:-1], params["rssm/posterior/hidden0/kernel"].shape[0] - config.deter)
     x = jnp.concatenate([a.astype(compute_dtype(config)) for a in (deter, tokens)], -1)
@@ -157,7 +166,8 @@ def observe_step(
     uniform: jax.Array,
     config: Config,
 ) -> tuple[Arrays, jax.Array]:
-    """One observed step of N rows: (carry, logits [N, S, C]). Rows with is_first start from zeros. [RSSM-13] to [RSSM-16]"""
+    """One observed step of N rows: (carry, logits [N, S, C]). Rows with is_first start from zeros. [RSSM-13] to
+    [RSSM-16]"""
     require_shape("is_first", is_first, "N")
     N = is_first.shape[0]
     require_shape("tokens", tokens, N, "E")
@@ -176,7 +186,8 @@ def observe(
     uniform: jax.Array,
     config: Config,
 ) -> Arrays:
-    """Reads a sequence: {"deter" [B, T, D], "stoch" [B, T, S, C], "logits" [B, T, S, C]}. [RSSM-13] to [RSSM-19], [RSSM-23]
+    """Reads a sequence: {"deter" [B, T, D], "stoch" [B, T, S, C], "logits" [B, T, S, C]}. [RSSM-13] to [RSSM-19],
+    [RSSM-23]
 
     carry: of B rows, constant; tokens [B, T, E]; prev_action [B, T, A]; is_first [B, T]; uniform [B, T, S].
 
@@ -203,7 +214,9 @@ def observe(
     scales = _core_scales(params) | {name: params[f"rssm/{name}/scale"] for name in layers}
     del biases["posterior/hidden0"]
     shapes = {name: (config.blocks, B) if name == "gru" else (B,) for name in biases}
-    added = {name: add_bias(jnp.zeros((T, *shapes[name], bias.shape[-1]), dtype), bias) for name, bias in biases.items()}
+    added = {
+        name: add_bias(jnp.zeros((T, *shapes[name], bias.shape[-1]), dtype), bias) for name, bias in biases.items()
+    }
     added["posterior/hidden0"] = from_tokens.swapaxes(0, 1)
     start = {
         "deter": stop_gradient(to_blocks(carry["deter"].astype(dtype), config.blocks)),
@@ -253,9 +266,9 @@ def _observe_loop(
 ) -> Arrays:
     """`_observe_scan`, with the gradients of the kernels taken after the loop.
 
-    Automatic differentiation would add up each kernel's gradient step by step: 64 thin products and 64 passes over all weights. Here the
-    loop is differentiated with constant kernels; the gradient of what was added to each product is that of the product itself, and one
-    large product over all steps makes the kernel's gradient of it.
+    Automatic differentiation would add up each kernel's gradient step by step: 64 thin products and 64 passes over all
+    weights. Here the loop is differentiated with constant kernels; the gradient of what was added to each product is
+    that of the product itself, and one large product over all steps makes the kernel's gradient of it.
     """
     return _observe_scan(config, kernels, scales, added, action, start, inputs)[0]
 
@@ -281,7 +294,11 @@ def _observe_loop_bwd(config: Config, saved: Any, g: Arrays) -> tuple[Any, ...]:
         if name in ("gru", "hidden_block"):
             gradient = added["gru"]
             if name == "hidden_block":
-                gradient = added["hidden_shared"].reshape(*added["hidden_shared"].shape[:2], config.blocks, -1).transpose(0, 2, 1, 3)
+                gradient = (
+                    added["hidden_shared"]
+                    .reshape(*added["hidden_shared"].shape[:2], config.blocks, -1)
+                    .transpose(0, 2, 1, 3)
+                )
             x, gradient = (a.swapaxes(0, 1).reshape(config.blocks, -1, a.shape[-1]) for a in (seen[name], gradient))
             return block_kernel_gradient(x, gradient, like[name].dtype)
         return product_kernel_gradient(seen[name], added[name], like[name].dtype)
@@ -293,7 +310,11 @@ _observe_loop.defvjp(_observe_loop_fwd, _observe_loop_bwd)
 
 
 def imagine(
-    params: Params, carry: Carry, policy: Callable[[jax.Array, jax.Array], jax.Array], uniform: jax.Array, config: Config
+    params: Params,
+    carry: Carry,
+    policy: Callable[[jax.Array, jax.Array], jax.Array],
+    uniform: jax.Array,
+    config: Config,
 ) -> Arrays:
     """Follows a policy through the prior, constant: {"deter" [N, H+1, D], "stoch" [N, H+1, S, C], "action" [N, H, A]}.
 
@@ -309,9 +330,14 @@ def imagine(
 
 
 def imagine_features(
-    params: Params, carry: Carry, policy: Callable[[jax.Array, jax.Array], jax.Array], uniform: jax.Array, config: Config
+    params: Params,
+    carry: Carry,
+    policy: Callable[[jax.Array, jax.Array], jax.Array],
+    uniform: jax.Array,
+    config: Config,
 ) -> tuple[jax.Array, jax.Array]:
-    """`imagine` with time first, as training wants it: uniform [H, N, S] -> features [H+1, N, F] and actions [H, N, A]."""
+    """`imagine` with time first, as training wants it: uniform [H, N, S] -> features [H+1, N, F] and actions [H, N,
+    A]."""
     _check_state(carry["deter"], carry["stoch"], config)
     require_shape("carry deter", carry["deter"], "N", config.deter)
     N = carry["deter"].shape[0]

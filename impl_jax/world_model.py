@@ -35,7 +35,8 @@ def continue_target(is_terminal: jax.Array, config: Config) -> jax.Array:
 
 
 def kl_losses(posterior_logits: jax.Array, prior_logits: jax.Array, config: Config) -> tuple[jax.Array, jax.Array]:
-    """(dynamics, representation) [...] in nats: KL of [..., S, C], summed over latents, then at least free_nats. [WM-10] to [WM-14]
+    """(dynamics, representation) [...] in nats: KL of [..., S, C], summed over latents, then at least free_nats.
+    [WM-10] to [WM-14]
 
     Section "World model learning", losses L_dyn and L_rep.
     """
@@ -51,7 +52,9 @@ def kl_losses(posterior_logits: jax.Array, prior_logits: jax.Array, config: Conf
     return clipped(stop_gradient(posterior), prior), clipped(posterior, stop_gradient(prior))
 
 
-def reconstruction_losses(predictions: Arrays, observations: Arrays, spaces: Spaces, config: Config) -> dict[str, jax.Array]:
+def reconstruction_losses(
+    predictions: Arrays, observations: Arrays, spaces: Spaces, config: Config
+) -> dict[str, jax.Array]:
     """key -> [...]: squared symlog error, cross-entropy in nats, or squared brightness error. [WM-2] to [WM-5], [WM-17]
 
     Raises:
@@ -74,7 +77,9 @@ def reconstruction_losses(predictions: Arrays, observations: Arrays, spaces: Spa
             require(jnp.issubdtype(x.dtype, jnp.integer), f"observation {key!r}", "an integer dtype", x.dtype)
             result[key] = -_discrete_log_prob(prediction, x, space)
         else:
-            result[key] = jnp.sum(symlog_mse_loss(prediction, x.astype(exact_dtype(config)), config.vector_loss_scale), axis=-1)
+            result[key] = jnp.sum(
+                symlog_mse_loss(prediction, x.astype(exact_dtype(config)), config.vector_loss_scale), axis=-1
+            )
     return result
 
 
@@ -89,8 +94,11 @@ def _discrete_log_prob(logits: jax.Array, x: jax.Array, space: Discrete) -> jax.
     return total
 
 
-def world_model_losses(params: Params, batch: Arrays, states: Arrays, spaces: Spaces, config: Config) -> dict[str, jax.Array]:
-    """All losses of the world model by name, [B, T] each, not weighted. [WM-1], [WM-6], [WM-8], [WM-9], [WM-15], [WM-16]
+def world_model_losses(
+    params: Params, batch: Arrays, states: Arrays, spaces: Spaces, config: Config
+) -> dict[str, jax.Array]:
+    """All losses of the world model by name, [B, T] each, not weighted. [WM-1], [WM-6], [WM-8], [WM-9], [WM-15],
+    [WM-16]
 
     states: what `observe` returned, {"deter" [B, T, D], "stoch" [B, T, S, C], "logits" [B, T, S, C]}.
     """
@@ -102,7 +110,9 @@ def world_model_losses(params: Params, batch: Arrays, states: Arrays, spaces: Sp
     dynamics, representation = kl_losses(states["logits"], rssm.prior(params, states["deter"], config), config)
     return {f"reconstruction/{key}": loss for key, loss in reconstruction.items()} | {
         "reward": symexp_twohot_loss(networks.reward_head(params, feature, config), batch["reward"], bins),
-        "continue": bernoulli_loss(networks.continue_head(params, feature, config), continue_target(batch["is_terminal"], config)),
+        "continue": bernoulli_loss(
+            networks.continue_head(params, feature, config), continue_target(batch["is_terminal"], config)
+        ),
         "dynamics": dynamics,
         "representation": representation,
     }
@@ -120,11 +130,13 @@ def open_loop(
 ) -> dict[str, jax.Array]:
     """What the model sees coming, from a few observations and then actions alone. [WM-20] to [WM-24]
 
-    observation: key -> [B, T, ...], of which the first `context` steps are read; prev_action [B, T, A]; is_first [B, T];
+    observation: key -> [B, T, ...], of which the first `context` steps are read; prev_action [B, T, A]; is_first [B,
+    T];
     noise: {"posterior" [B, context, S], "prior" [B, T - context, S]}.
 
     Returns:
-      By observation key [B, T, ...]: numbers in their own units, probabilities, images in [0, 1]; "reward" and "continue_" [B, T].
+      By observation key [B, T, ...]: numbers in their own units, probabilities, images in [0, 1]; "reward" and
+      "continue_" [B, T].
 
     Raises:
       ValueError: a missing key, a wrong shape or dtype, or a context that is not within the sequence.
@@ -139,20 +151,32 @@ def open_loop(
         require(key in observation, "observation", f"the key {key!r}", f"the keys {sorted(observation)}")
         require_shape(f"observation {key!r}", observation[key], B, T, *space.array_shape)
 
-    tokens = networks.encoder(params, {key: observation[key][:, :context] for key in spaces.observations}, spaces, config)
+    tokens = networks.encoder(
+        params, {key: observation[key][:, :context] for key in spaces.observations}, spaces, config
+    )
     dtype = compute_dtype(config)
     start = {"deter": jnp.zeros((B, config.deter), dtype), "stoch": jnp.zeros((B, config.stoch, config.classes), dtype)}
-    seen = rssm.observe(params, start, tokens, prev_action[:, :context], is_first[:, :context], noise["posterior"], config)
+    seen = rssm.observe(
+        params, start, tokens, prev_action[:, :context], is_first[:, :context], noise["posterior"], config
+    )
 
-    def step(carry: dict[str, jax.Array], now: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[dict[str, jax.Array], Arrays]:
+    def step(
+        carry: dict[str, jax.Array], now: tuple[jax.Array, jax.Array, jax.Array]
+    ) -> tuple[dict[str, jax.Array], Arrays]:
         action, first, uniform = now
-        deter, stoch, action = (jnp.where(first.reshape(B, *[1] * (x.ndim - 1)), 0, x) for x in (carry["deter"], carry["stoch"], action))
+        deter, stoch, action = (
+            jnp.where(first.reshape(B, *[1] * (x.ndim - 1)), 0, x) for x in (carry["deter"], carry["stoch"], action)
+        )
         deter = rssm.core(params, deter, stoch, action, config)
         sample = categorical_sample(unimix_log_probs(rssm.prior(params, deter, config), config.latent_unimix), uniform)
         carry = {"deter": deter, "stoch": sample.astype(dtype)}
         return carry, carry
 
-    inputs = (prev_action[:, context:].swapaxes(0, 1), is_first[:, context:].swapaxes(0, 1), noise["prior"].swapaxes(0, 1))
+    inputs = (
+        prev_action[:, context:].swapaxes(0, 1),
+        is_first[:, context:].swapaxes(0, 1),
+        noise["prior"].swapaxes(0, 1),
+    )
     _, unseen = lax.scan(step, {name: seen[name][:, -1] for name in start}, inputs)
     states = {name: jnp.concatenate([seen[name], unseen[name].swapaxes(0, 1)], 1) for name in start}
 

@@ -22,7 +22,13 @@ from impl_torch.distributions import bernoulli_mean, symexp_twohot_mean
 from impl_torch.layers import Params, for_many_rows, truncated_normal
 from impl_torch.networks import Observations, actor, continue_head, critic, encoder, feature, reward_head
 from impl_torch.optimizer import optimizer_step
-from impl_torch.returns import cumulative_weights, lambda_return, replay_lambda_return, return_scale, update_return_range
+from impl_torch.returns import (
+    cumulative_weights,
+    lambda_return,
+    replay_lambda_return,
+    return_scale,
+    update_return_range,
+)
 from impl_torch.rssm import Carry, freeze, imagine_features, observe, observe_step, prepare
 from impl_torch.shapes import expect_keys, expect_shape, wide_dtype
 from impl_torch.transforms import standard_bins
@@ -35,7 +41,9 @@ State = Mapping[str, Any]
 
 def initial_parameters(table: Mapping[str, Parameter], uniforms: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Every parameter of the table, from uniforms in the shape of each kernel. [AGT-1] [AGT-3] to [AGT-6]"""
-    expect_keys("uniforms", uniforms, (name for name, entry in table.items() if entry.initializer == "truncated_normal"))
+    expect_keys(
+        "uniforms", uniforms, (name for name, entry in table.items() if entry.initializer == "truncated_normal")
+    )
     like = next(iter(uniforms.values()))
     params = {}
     for name, entry in table.items():
@@ -56,7 +64,10 @@ def initial_state(params: Mapping[str, Tensor]) -> dict[str, Any]:
         "slow_critic": {name: x.detach().clone() for name, x in params.items() if name.startswith("critic/")},
         "optimizer": {
             "step": 0,
-            **{moment: {name: torch.zeros_like(x) for name, x in params.items()} for moment in ("second_moment", "momentum")},
+            **{
+                moment: {name: torch.zeros_like(x) for name, x in params.items()}
+                for moment in ("second_moment", "momentum")
+            },
         },
         "return_range": {"low": zero, "high": zero.clone()},
     }
@@ -76,14 +87,16 @@ def policy_step(
 ) -> tuple[dict[str, Tensor], Tensor]:
     """One acting step of N rows: the new carry and the flat action [N, A]. [AGT-11] [AGT-12] [AGT-13]
 
-    carry of N rows, prev_action [N, A], observation {key: [N, ...]}, is_first [N], noise {"posterior" [N, S], "action" [N, K]}.
-    mode: the action is the mode of the actor, not a sample. [LOOP-71]
+    carry of N rows, prev_action [N, A], observation {key: [N, ...]}, is_first [N], noise {"posterior" [N, S], "action"
+    [N, K]}. mode: the action is the mode of the actor, not a sample. [LOOP-71]
     """
     params = prepare(params, config)
     tokens = encoder(params, observation, spaces, config)
     carry, _ = observe_step(params, carry, tokens, prev_action, is_first, noise["posterior"], config)
     outputs = actor(params, feature(carry["deter"], carry["stoch"]), spaces, config)
-    return dict(carry), mode_action(outputs, spaces, config) if mode else sample_action(outputs, noise["action"], spaces, config)
+    return dict(carry), mode_action(outputs, spaces, config) if mode else sample_action(
+        outputs, noise["action"], spaces, config
+    )
 
 
 def losses(
@@ -101,7 +114,8 @@ def losses(
     return_range: (low, high); batch: observations [B, T, ...], "reward", "is_first", "is_last", "is_terminal" [B, T],
     "prev_action" [B, T, A], "deter" [B, D], "stoch" [B, S] class indices;
     noise: "posterior" [B, T, S], "prior" [N, H, S], "action" [N, H, K];
-    aux: "losses" {name: scalar} with gradients, "return_range", "deter" [B, T, D], "stoch" [B, T, S, C] and "metrics" {name: scalar}.
+    aux: "losses" {name: scalar} with gradients, "return_range", "deter" [B, T, D], "stoch" [B, T, S, C] and "metrics"
+    {name: scalar}.
     """
     B, T = _check(params, batch, noise, spaces, config)
     params = for_many_rows(prepare(params, config))
@@ -116,7 +130,8 @@ def losses(
     states = observe(params, start, tokens, batch["prev_action"], batch["is_first"], noise["posterior"], config)
     values: dict[str, Tensor] = world_model_losses(params, batch, states, spaces, config)
 
-    # Imagination. The actor's outputs are kept with their gradients, so that its loss needs no second pass over the same states.
+    # Imagination. The actor's outputs are kept with their gradients, so that its loss needs no second pass over the
+    # same states.
     constants = {name: states[name].detach() for name in ("deter", "stoch")}
     outputs = []
 
@@ -125,7 +140,9 @@ def losses(
             outputs.append(actor(params, state, spaces, config))
         return sample_action(outputs[-1], noise["action"][:, t], spaces, config)
 
-    features, actions = imagine_features(frozen, {name: x.flatten(0, 1) for name, x in constants.items()}, policy, noise["prior"], config)
+    features, actions = imagine_features(
+        frozen, {name: x.flatten(0, 1) for name, x in constants.items()}, policy, noise["prior"], config
+    )
     logits = _over_time(lambda x: critic(params, x, config), features[:H])
     with torch.no_grad():
         slow_logits = _over_time(lambda x: critic(slow_critic, x, config), features[:H])
@@ -145,14 +162,17 @@ def losses(
 
     # Actor and critic.
     policies = {
-        key: {name: torch.stack([output[key][name] for output in outputs], 1) for name in outputs[0][key]} for key in spaces.actions
+        key: {name: torch.stack([output[key][name] for output in outputs], 1) for name in outputs[0][key]}
+        for key in spaces.actions
     }
     log_prob = action_log_prob(policies, torch.stack(actions, 1), spaces, config)
     entropy = action_entropy(policies, spaces, config)
     values["actor"] = actor_loss(log_prob, entropy, returns, value[:, :H], weight, scale, config)
     values["critic"] = critic_loss(logits, slow_logits, returns, weight, config)
     if T > 1:
-        values["replay_critic"] = _replay_critic_loss(params, slow_critic, states, returns[:, 0].view(B, T), batch, config)
+        values["replay_critic"] = _replay_critic_loss(
+            params, slow_critic, states, returns[:, 0].view(B, T), batch, config
+        )
 
     means = {name: x.mean() for name, x in values.items()}
     means.setdefault("replay_critic", returns.new_zeros(()))
@@ -169,7 +189,9 @@ def losses(
     return total, {"losses": means, "return_range": (low, high), **constants, "metrics": metrics}
 
 
-def _check(params: Params, batch: Observations, noise: Mapping[str, Tensor], spaces: Spaces, config: Config) -> tuple[int, int]:
+def _check(
+    params: Params, batch: Observations, noise: Mapping[str, Tensor], spaces: Spaces, config: Config
+) -> tuple[int, int]:
     """B and T, if everything has the names and shapes that belong to them. [CON-8] [CON-20]"""
     flags = ("reward", "is_first", "is_last", "is_terminal")
     steps = {key: space.array_shape for key, space in spaces.observations.items()} | dict.fromkeys(flags, ())
@@ -193,14 +215,20 @@ def _check(params: Params, batch: Observations, noise: Mapping[str, Tensor], spa
 
 
 def _over_time(head: Callable[[Tensor], Tensor], features: list[Tensor]) -> Tensor:
-    """A head at t imagined states [N, F] each -> [N, t, ...]: on the CPU step by step, in the cache; elsewhere all at once."""
+    """A head at t imagined states [N, F] each -> [N, t, ...]: on the CPU step by step, in the cache; elsewhere all at
+    once."""
     if features[0].device.type == "cpu":
         return torch.stack([head(x) for x in features], 1)
     return head(torch.stack(features)).transpose(0, 1)
 
 
 def _replay_critic_loss(
-    params: Params, slow_critic: Params, states: Mapping[str, Tensor], annotation: Tensor, batch: Observations, config: Config
+    params: Params,
+    slow_critic: Params,
+    states: Mapping[str, Tensor],
+    annotation: Tensor,
+    batch: Observations,
+    config: Config,
 ) -> Tensor:
     """[B, T-1], with gradients into the states. [AGT-25]"""
     state = feature(states["deter"], states["stoch"])[:, :-1]
@@ -225,7 +253,8 @@ def gradients(
     spaces: Spaces,
     config: Config,
 ) -> tuple[dict[str, Tensor], Tensor, dict[str, Any]]:
-    """The gradient of the total by every parameter, zeros where there is none, with what `losses` returns. [AGT-28] [AGT-32] [OPT-18]"""
+    """The gradient of the total by every parameter, zeros where there is none, with what `losses` returns. [AGT-28]
+    [AGT-32] [OPT-18]"""
     leaves = {name: x if x.requires_grad else x.detach().requires_grad_() for name, x in params.items()}
     with torch.enable_grad():
         total, aux = losses(leaves, slow_critic, return_range, batch, noise, spaces, config)

@@ -79,13 +79,18 @@ def _distributions(outputs: Outputs, spaces: Spaces, config: Config) -> list[_Ca
     parts: list[_Categorical | _Normal] = []
     for key, space in spaces.actions.items():
         raw = outputs[key]
-        expect_keys(f"outputs[{key!r}]", raw, ("mean", "std") if isinstance(space, Vector) else ("logits",), exactly=True)
+        expect_keys(
+            f"outputs[{key!r}]", raw, ("mean", "std") if isinstance(space, Vector) else ("logits",), exactly=True
+        )
         for name, x in raw.items():
             expect_shape(f"outputs[{key!r}][{name!r}]", x, (*leading, space.encoded_size))
         if isinstance(space, Vector):
             parts.append(_Normal(*bounded_normal(raw["mean"], raw["std"], config.actor_min_std, config.actor_max_std)))
         else:
-            parts += [_Categorical(unimix_log_probs(logits, config.actor_unimix)) for logits in raw["logits"].split(space.classes, -1)]
+            parts += [
+                _Categorical(unimix_log_probs(logits, config.actor_unimix))
+                for logits in raw["logits"].split(space.classes, -1)
+            ]
     return parts
 
 
@@ -95,7 +100,8 @@ def _leading(outputs: Outputs) -> torch.Size:
 
 @torch.no_grad()
 def sample_action(outputs: Outputs, noise: Tensor, spaces: Spaces, config: Config) -> Tensor:
-    """A flat action [..., A], constant, from noise [..., K]. [BEH-1] [BEH-3] [BEH-4] [BEH-5] [BEH-8] [BEH-22] [BEH-23]"""
+    """A flat action [..., A], constant, from noise [..., K]. [BEH-1] [BEH-3] [BEH-4] [BEH-5] [BEH-8] [BEH-22]
+    [BEH-23]"""
     parts = _distributions(outputs, spaces, config)
     expect_shape("noise", noise, (*_leading(outputs), spaces.action_noise_size))
     pieces = noise.split([part.sizes[1] for part in parts], -1)
@@ -109,7 +115,8 @@ def mode_action(outputs: Outputs, spaces: Spaces, config: Config) -> Tensor:
 
 
 def action_log_prob(outputs: Outputs, action: Tensor, spaces: Spaces, config: Config) -> Tensor:
-    """Log-probability of a flat action [..., A], a constant, summed over everything: [...]. [BEH-5] [BEH-6] [BEH-22] [BEH-23]"""
+    """Log-probability of a flat action [..., A], a constant, summed over everything: [...]. [BEH-5] [BEH-6] [BEH-22]
+    [BEH-23]"""
     parts = _distributions(outputs, spaces, config)
     expect_shape("action", action, (*_leading(outputs), spaces.action_size))
     pieces = action.detach().split([part.sizes[0] for part in parts], -1)
@@ -122,7 +129,13 @@ def action_entropy(outputs: Outputs, spaces: Spaces, config: Config) -> Tensor:
 
 
 def actor_loss(
-    log_prob: Tensor, entropy: Tensor, returns: Tensor, value: Tensor, weight: Tensor, scale: Tensor | float, config: Config
+    log_prob: Tensor,
+    entropy: Tensor,
+    returns: Tensor,
+    value: Tensor,
+    weight: Tensor,
+    scale: Tensor | float,
+    config: Config,
 ) -> Tensor:
     """-weight * (advantage * log_prob + entropy_scale * entropy): [N, H] five times -> [N, H].
 
@@ -147,7 +160,8 @@ def critic_loss(logits: Tensor, slow_logits: Tensor, returns: Tensor, weight: Te
 
 
 def replay_critic_loss(logits: Tensor, slow_logits: Tensor, returns: Tensor, is_last: Tensor, config: Config) -> Tensor:
-    """The same without weights and with the last steps of episodes masked: [B, T-1]. [BEH-14] [BEH-15] [BEH-22] [BEH-23] [BEH-24]"""
+    """The same without weights and with the last steps of episodes masked: [B, T-1]. [BEH-14] [BEH-15] [BEH-22]
+    [BEH-23] [BEH-24]"""
     expect_same_shape(returns=returns, is_last=is_last)
     loss = _critic_cross_entropy(logits, slow_logits, returns, config)
     return (1 - is_last.to(loss.dtype)) * loss
@@ -158,14 +172,17 @@ def _critic_cross_entropy(logits: Tensor, slow_logits: Tensor, returns: Tensor, 
     expect_same_shape(logits=logits, slow_logits=slow_logits)
     logits = widen(logits)
     bins = standard_bins(config.bins, logits.dtype, logits.device)
-    targets = torch.stack([returns.to(logits.dtype), symexp_twohot_mean(slow_logits.detach().to(logits.dtype), bins)], -1)
+    targets = torch.stack(
+        [returns.to(logits.dtype), symexp_twohot_mean(slow_logits.detach().to(logits.dtype), bins)], -1
+    )
     towards_return, towards_slow = twohot_cross_entropies(unimix_log_probs(logits, 0.0), targets, bins).unbind(-1)
     return towards_return + config.slow_critic_scale * towards_slow
 
 
 @torch.no_grad()
 def update_slow_critic(slow: Mapping[str, Tensor], critic: Mapping[str, Tensor], decay: float) -> dict[str, Tensor]:
-    """decay * slow + (1 - decay) * critic, as a new mapping; critic may hold more than `critic/...`. [BEH-19] [BEH-20] [BEH-21]"""
+    """decay * slow + (1 - decay) * critic, as a new mapping; critic may hold more than `critic/...`. [BEH-19] [BEH-20]
+    [BEH-21]"""
     live = {name: x for name, x in critic.items() if name.startswith("critic/")}
     expect_keys("slow", slow, live, exactly=True)
     for name, x in slow.items():

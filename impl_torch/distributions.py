@@ -22,7 +22,8 @@ def _constant(x: Tensor, like: Tensor) -> Tensor:
 
 
 def unimix_log_probs(logits: Tensor, unimix: float) -> Tensor:
-    """ln((1 - unimix) softmax(logits) + unimix / C) over the last axis, [..., C] -> [..., C]. [DIS-5] [DIS-6] [DIS-7]"""
+    """ln((1 - unimix) softmax(logits) + unimix / C) over the last axis, [..., C] -> [..., C]. [DIS-5] [DIS-6]
+    [DIS-7]"""
     if unimix == 0:
         return _over_classes(F.log_softmax, widen(logits))
     return unimix_probs(logits, unimix).log()
@@ -35,7 +36,8 @@ def unimix_probs(logits: Tensor, unimix: float) -> Tensor:
 
 
 def _over_classes(function: Callable[[Tensor, int], Tensor], logits: Tensor) -> Tensor:
-    """A softmax over the last axis. PyTorch's CPU code is many times faster along the first axis where classes are few."""
+    """A softmax over the last axis. PyTorch's CPU code is many times faster along the first axis where classes are
+    few."""
     if logits.shape[-1] >= FEW_CLASSES or logits.device.type != "cpu":
         return function(logits, -1)
     return function(logits.movedim(-1, 0).contiguous(), 0).movedim(0, -1)
@@ -61,7 +63,8 @@ def straight_through(log_probs: Tensor, sample: Tensor) -> Tensor:
 
 
 def categorical_log_prob(log_probs: Tensor, onehot: Tensor) -> Tensor:
-    """Log-probability of the chosen class, 0 for an all-zero onehot: [..., C] twice -> [...]. [DIS-4] [DIS-10] [DIS-13]"""
+    """Log-probability of the chosen class, 0 for an all-zero onehot: [..., C] twice -> [...]. [DIS-4] [DIS-10]
+    [DIS-13]"""
     expect_same_shape(log_probs=log_probs, onehot=onehot)
     log_probs = widen(log_probs)
     onehot = _constant(onehot, log_probs)

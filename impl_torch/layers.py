@@ -1,6 +1,7 @@
 """Layers: the parts that networks are built from. Chapter: spec/03-layers.md.
 
-Images are [..., H, W, C]. For PyTorch that is a "channels last" tensor seen through a permutation, so nothing is copied.
+Images are [..., H, W, C]. For PyTorch that is a "channels last" tensor seen through a permutation, so nothing is
+copied.
 """
 
 import math
@@ -16,18 +17,23 @@ from impl_torch.shapes import expect, expect_last, expect_shape, widen
 Params = Mapping[str, Tensor]
 
 TRUNCATED_STD = 0.8796256610342398  # of the standard normal cut at +-2
-# From this many rows on, a float32 product on the CPU is computed as a 1x1 convolution. PyTorch gives matrix products to MKL, which on AMD
-# processors does not use AVX-512, and convolutions to oneDNN, which does: about 1.8 times faster on a Zen 5, and no slower elsewhere.
-# Below it, oneDNN's rearrangement of the kernel costs more than it wins. A single thread never reaches oneDNN, and loses nothing.
+# From this many rows on, a float32 product on the CPU is computed as a 1x1 convolution. PyTorch gives matrix products
+# to MKL, which on AMD processors does not use AVX-512, and convolutions to oneDNN, which does: about 1.8 times faster
+# on a Zen 5, and no slower elsewhere. Below it, oneDNN's rearrangement of the kernel costs more than it wins. A single
+# thread never reaches oneDNN, and loses nothing.
 CONVOLUTION_ROWS = 256
 
 
 NARROW = (torch.bfloat16, torch.float16)
-_WIDE_OUTPUT = tuple(int(part) for part in torch.__version__.split(".")[:2]) >= (2, 8)  # torch.mm and torch.bmm know out_dtype
+_WIDE_OUTPUT = tuple(int(part) for part in torch.__version__.split(".")[:2]) >= (
+    2,
+    8,
+)  # torch.mm and torch.bmm know out_dtype
 
 
 def wide_product(x: Tensor, y: Tensor) -> Tensor:
-    """x @ y, of two or three axes, in float32 or better whatever the dtype of x and y: for gradients of kernels. [CON-23]"""
+    """x @ y, of two or three axes, in float32 or better whatever the dtype of x and y: for gradients of kernels.
+    [CON-23]"""
     if x.dtype not in NARROW:
         return x @ y
     if _WIDE_OUTPUT and x.device.type == "cuda":
@@ -36,7 +42,8 @@ def wide_product(x: Tensor, y: Tensor) -> Tensor:
 
 
 class _NarrowProduct(torch.autograd.Function):
-    """A linear or block-linear layer in bfloat16 with float32 gradients of kernel and bias: autograd would round them to bfloat16.
+    """A linear or block-linear layer in bfloat16 with float32 gradients of kernel and bias: autograd would round them
+    to bfloat16.
 
     x [G, N, in], kernel [G, in, out], bias [G, 1, out] or None.
     """
@@ -58,11 +65,17 @@ class _NarrowProduct(torch.autograd.Function):
 
 
 def _as_convolution(x: Tensor, rows: int) -> bool:
-    return rows >= CONVOLUTION_ROWS and x.device.type == "cpu" and x.dtype == torch.float32 and torch.backends.mkldnn.is_available()
+    return (
+        rows >= CONVOLUTION_ROWS
+        and x.device.type == "cpu"
+        and x.dtype == torch.float32
+        and torch.backends.mkldnn.is_available()
+    )
 
 
 def for_many_rows(params: Params) -> Params:
-    """The same parameters with kernels in the memory order that oneDNN wants, or every product would bring its kernel into it first."""
+    """The same parameters with kernels in the memory order that oneDNN wants, or every product would bring its kernel
+    into it first."""
 
     def arrange(x: Tensor) -> Tensor:
         fits = x.ndim in (2, 3) and _as_convolution(x, CONVOLUTION_ROWS)
@@ -99,7 +112,8 @@ def linear(x: Tensor, kernel: Tensor, bias: Tensor | None) -> Tensor:
 
 
 def block_linear(x: Tensor, kernel: Tensor, bias: Tensor | None) -> Tensor:
-    """A linear layer of G contiguous blocks: [..., in], [G, in/G, out/G], [out] -> [..., out]. [LAY-1] [LAY-3] [LAY-15]"""
+    """A linear layer of G contiguous blocks: [..., in], [G, in/G, out/G], [out] -> [..., out]. [LAY-1] [LAY-3]
+    [LAY-15]"""
     expect(kernel.ndim == 3, "kernel", "shape [G, in/G, out/G]", list(kernel.shape))
     blocks, inputs, outputs = kernel.shape
     expect_last("x", x, blocks * inputs)
@@ -130,7 +144,8 @@ def normalize(x: Tensor, epsilon: float) -> tuple[Tensor, Tensor]:
 
 
 def rms_norm(x: Tensor, scale: Tensor, epsilon: float) -> Tensor:
-    """x / sqrt(mean(x^2) + epsilon) * scale over the last axis: [..., n] and [n] -> [..., n]. [LAY-1] [LAY-4] [LAY-15]"""
+    """x / sqrt(mean(x^2) + epsilon) * scale over the last axis: [..., n] and [n] -> [..., n]. [LAY-1] [LAY-4]
+    [LAY-15]"""
     expect_shape("scale", scale, x.shape[-1:])
     normal, _ = normalize(x, epsilon)
     rounded = scale + (scale.to(x.dtype) - scale).detach()  # in this way its gradient is not rounded too [CON-23]
@@ -168,7 +183,8 @@ def norm_gradients(gradient: Tensor, normal: Tensor, inverse: Tensor, scale: Ten
 
 
 class _NormSilu(torch.autograd.Function):
-    """Keeps nothing but its input and recomputes the rest, where autograd would keep, and read again, every intermediate result."""
+    """Keeps nothing but its input and recomputes the rest, where autograd would keep, and read again, every
+    intermediate result."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, scale: Tensor, epsilon: float) -> Tensor:
@@ -186,7 +202,8 @@ class _NormSilu(torch.autograd.Function):
 
 
 class _BiasGradient(torch.autograd.Function):
-    """y [..., out], to which the bias was added before; its gradient is summed here, in float32: libraries would round it. [CON-23]"""
+    """y [..., out], to which the bias was added before; its gradient is summed here, in float32: libraries would round
+    it. [CON-23]"""
 
     @staticmethod
     def forward(ctx: Any, y: Tensor, bias: Tensor) -> Tensor:
@@ -205,7 +222,9 @@ def _inner_bias(bias: Tensor, dtype: torch.dtype) -> Tensor:
 
 def _check_convolution(x: Tensor, kernel: Tensor, bias: Tensor) -> None:
     expect(x.ndim >= 3, "x", "shape [..., H, W, in]", list(x.shape))
-    expect(kernel.ndim == 4 and tuple(kernel.shape[:2]) == (5, 5), "kernel", "shape [5, 5, in, out]", list(kernel.shape))
+    expect(
+        kernel.ndim == 4 and tuple(kernel.shape[:2]) == (5, 5), "kernel", "shape [5, 5, in, out]", list(kernel.shape)
+    )
     expect_last("x", x, kernel.shape[2])
     expect_shape("bias", bias, kernel.shape[3:])
 
@@ -222,7 +241,8 @@ def _to_pixels(y: Tensor, x: Tensor) -> Tensor:
 
 
 def convolution(x: Tensor, kernel: Tensor, bias: Tensor, stride: int) -> Tensor:
-    """5x5 cross-correlation: [..., H, W, in], [5, 5, in, out], [out] -> [..., H/stride, W/stride, out]. [LAY-1] [LAY-6] [LAY-15]"""
+    """5x5 cross-correlation: [..., H, W, in], [5, 5, in, out], [out] -> [..., H/stride, W/stride, out]. [LAY-1] [LAY-6]
+    [LAY-15]"""
     _check_convolution(x, kernel, bias)
     expect(stride in (1, 2), "stride", "1 or 2", stride)
     expect(stride == 1 or not (x.shape[-3] % 2 or x.shape[-2] % 2), "x", "even sides at stride 2", list(x.shape))
@@ -230,16 +250,21 @@ def convolution(x: Tensor, kernel: Tensor, bias: Tensor, stride: int) -> Tensor:
     if stride == 2:
         planes = F.pad(planes, (1, 2, 1, 2))
     inner = _inner_bias(bias, x.dtype)
-    y = _to_pixels(F.conv2d(planes, kernel.to(x.dtype).permute(3, 2, 0, 1), inner, stride, padding=2 if stride == 1 else 0), x)
+    y = _to_pixels(
+        F.conv2d(planes, kernel.to(x.dtype).permute(3, 2, 0, 1), inner, stride, padding=2 if stride == 1 else 0), x
+    )
     return _BiasGradient.apply(y, bias) if x.dtype in NARROW else y
 
 
 def transposed_convolution(x: Tensor, kernel: Tensor, bias: Tensor) -> Tensor:
-    """The adjoint of the stride-2 convolution: [..., H, W, in], [5, 5, in, out], [out] -> [..., 2H, 2W, out]. [LAY-1] [LAY-7] [LAY-15]"""
+    """The adjoint of the stride-2 convolution: [..., H, W, in], [5, 5, in, out], [out] -> [..., 2H, 2W, out]. [LAY-1]
+    [LAY-7] [LAY-15]"""
     _check_convolution(x, kernel, bias)
     inner = _inner_bias(bias, x.dtype)
     y = F.conv_transpose2d(_to_planes(x), kernel.to(x.dtype).permute(2, 3, 0, 1), inner, stride=2, padding=1)
-    y = _to_pixels(y[:, :, :-1, :-1], x)  # PyTorch pads on both sides alike, so one row and one column come out too many
+    y = _to_pixels(
+        y[:, :, :-1, :-1], x
+    )  # PyTorch pads on both sides alike, so one row and one column come out too many
     return _BiasGradient.apply(y, bias) if x.dtype in NARROW else y
 
 
@@ -273,7 +298,8 @@ def mlp(params: Params, name: str, x: Tensor, layers: int, epsilon: float) -> Te
 
 
 def truncated_normal(uniform: Tensor, fan_in: int, outscale: float) -> Tensor:
-    """Initial weights from uniforms, any shape: standard deviation outscale / sqrt(fan_in). [LAY-9] [LAY-10] [LAY-11]"""
+    """Initial weights from uniforms, any shape: standard deviation outscale / sqrt(fan_in). [LAY-9] [LAY-10]
+    [LAY-11]"""
     expect(fan_in >= 1, "fan_in", "at least 1", fan_in)
     normal = math.sqrt(2) * torch.erfinv((2 * uniform - 1) * math.erf(math.sqrt(2)))
     return normal.clamp(-2, 2) * (outscale / math.sqrt(fan_in) / TRUNCATED_STD)

@@ -1,4 +1,4 @@
-"""What training talks to: one agent and its optimizer on one device. Interface: train/backend.py."""
+"""What training talks to: one agent and its optimizer on one device. Interface: dreamer_spec/backend.py."""
 
 import re
 from collections.abc import Mapping
@@ -22,8 +22,9 @@ Arrays = Mapping[str, np.ndarray]
 class Learner:
     """One agent.
 
-    All of its state lies in a few flat buffers that a train step changes in place. seed: of the initial parameters. nonfinite: "stop" or
-    "skip", [LOOP-40] to [LOOP-42]. threads: that compute on the CPU, in the whole process; None leaves them as they are.
+    All of its state lies in a few flat buffers that a train step changes in place. seed: of the initial parameters.
+    nonfinite: "stop" or "skip", [LOOP-40] to [LOOP-42]. threads: that compute on the CPU, in the whole process; None
+    leaves them as they are.
 
     Raises:
       ValueError: a device that is unknown or not there, or another word for `nonfinite`.
@@ -54,7 +55,9 @@ class Learner:
         table = parameter_table(config, spaces)
         kernels = {name: entry.shape for name, entry in table.items() if entry.initializer == "truncated_normal"}
         generator = self._generator(seed)
-        self.parameters = Parameters(initial_parameters(table, {name: self._uniform(generator, *shape) for name, shape in kernels.items()}))
+        self.parameters = Parameters(
+            initial_parameters(table, {name: self._uniform(generator, *shape) for name, shape in kernels.items()})
+        )
         self._flat, self._layout = self.parameters.flat, self.parameters.layout
         self._critic_layout = Layout({name: entry.shape for name, entry in table.items() if name.startswith("critic/")})
         self._critic_flat = self._flat[-self._critic_layout.total :]  # the critic is the last of the table
@@ -63,13 +66,18 @@ class Learner:
         self._second_moment, self._momentum, self._gradient = (torch.zeros_like(self._flat) for _ in range(3))
         self._set_step(0)
         self._low, self._high = torch.zeros((2,), dtype=self._dtype, device=self._device).unbind()
-        self._acting: Mapping[str, Tensor] | None = None  # the parameters as the policy uses them, until the next train step
+        self._acting: Mapping[str, Tensor] | None = (
+            None  # the parameters as the policy uses them, until the next train step
+        )
 
     def initial_carry(self, envs: int) -> dict[str, Tensor]:
         """All zeros: {"deter" [N, D], "stoch" [N, S, C], "action" [N, A]}. [CON-5]"""
         c = self.config
         shapes = {"deter": (c.deter,), "stoch": (c.stoch, c.classes)}
-        carry = {name: torch.zeros(envs, *shape, dtype=compute_dtype(c), device=self._device) for name, shape in shapes.items()}
+        carry = {
+            name: torch.zeros(envs, *shape, dtype=compute_dtype(c), device=self._device)
+            for name, shape in shapes.items()
+        }
         return carry | {"action": torch.zeros(envs, self.spaces.action_size, dtype=self._dtype, device=self._device)}
 
     def save_carry(self, carry: Mapping[str, Tensor]) -> dict[str, np.ndarray]:
@@ -89,7 +97,8 @@ class Learner:
     def policy(
         self, observation: Arrays, is_first: np.ndarray, carry: Mapping[str, Tensor], seed: int, mode: bool = False
     ) -> tuple[np.ndarray, Arrays, dict[str, Tensor]]:
-        """One acting step: observation {key: [N, ...]}, is_first [N], seed of the noise -> (action [N, A], latents, carry). [AGT-11]
+        """One acting step: observation {key: [N, ...]}, is_first [N], seed of the noise -> (action [N, A], latents,
+        carry). [AGT-11]
 
         mode: the action is the mode of the actor, [LOOP-71].
 
@@ -104,7 +113,15 @@ class Learner:
             self._acting = freeze(self.parameters.mapping(), self.config)
         inputs = {key: self._to_device(observation[key]) for key in self.spaces.observations}
         state, action = policy_step(
-            self._acting, carry, carry["action"], inputs, self._to_device(is_first), noise, self.spaces, self.config, mode
+            self._acting,
+            carry,
+            carry["action"],
+            inputs,
+            self._to_device(is_first),
+            noise,
+            self.spaces,
+            self.config,
+            mode,
         )
         taken = _to_host(action.float())  # on its way before the latents, which nobody waits for here
         latents = {"deter": _to_host(state["deter"].float()), "stoch": _to_host(state["stoch"].argmax(-1))}
@@ -117,8 +134,8 @@ class Learner:
         """
         _, metrics, factors, aux = self._differentiate(batch, seed)
         with torch.no_grad():
-            # Read on the host: with a GPU, its queue runs empty here once a step. An update that is chosen on the device would have to
-            # write every buffer anew.
+            # Read on the host: with a GPU, its queue runs empty here once a step. An update that is chosen on the
+            # device would have to write every buffer anew.
             finite = bool(torch.stack([metrics["loss/total"].double(), metrics["gradient_norm"]]).isfinite().all())
             applied = finite and not self._stopped
             self._stopped = self._nonfinite == "stop" and not applied
@@ -132,13 +149,19 @@ class Learner:
         return {name: _Element(values, index) for index, name in enumerate(metrics)}, latents
 
     def gradients(self, batch: Arrays, seed: int) -> tuple[dict[str, float], dict[str, np.ndarray]]:
-        """The metrics and the gradient of every parameter that a train step would compute now. Changes nothing. [LOOP-44]"""
+        """The metrics and the gradient of every parameter that a train step would compute now. Changes nothing.
+        [LOOP-44]"""
         by_name, metrics, _, _ = self._differentiate(batch, seed)
-        return {name: float(x) for name, x in metrics.items()}, {name: x.cpu().numpy().copy() for name, x in by_name.items()}
+        return {name: float(x) for name, x in metrics.items()}, {
+            name: x.cpu().numpy().copy() for name, x in by_name.items()
+        }
 
     @torch.no_grad()
-    def predict(self, observation: Arrays, prev_action: np.ndarray, is_first: np.ndarray, context: int, seed: int) -> dict[str, np.ndarray]:
-        """The open-loop prediction of {key: [B, T, ...]}, prev_action [B, T, A], is_first [B, T], with the noise of a seed. [WM-20]"""
+    def predict(
+        self, observation: Arrays, prev_action: np.ndarray, is_first: np.ndarray, context: int, seed: int
+    ) -> dict[str, np.ndarray]:
+        """The open-loop prediction of {key: [B, T, ...]}, prev_action [B, T, A], is_first [B, T], with the noise of a
+        seed. [WM-20]"""
         generator, (B, T) = self._generator(seed), np.shape(is_first)
         noise = {
             "posterior": self._uniform(generator, B, max(0, context), self.config.stoch),
@@ -146,7 +169,9 @@ class Learner:
         }
         inputs = {key: self._to_device(observation[key]) for key in self.spaces.observations if key in observation}
         actions, starts = self._to_device(prev_action), self._to_device(is_first)
-        predictions = open_loop(self.parameters.mapping(), inputs, actions, starts, context, noise, self.spaces, self.config)
+        predictions = open_loop(
+            self.parameters.mapping(), inputs, actions, starts, context, noise, self.spaces, self.config
+        )
         return {key: value.cpu().numpy() for key, value in predictions.items()}
 
     def state_dict(self) -> dict[str, np.ndarray]:
@@ -162,14 +187,18 @@ class Learner:
           ValueError: a missing or unexpected name, or a wrong shape; nothing is changed then.
         """
         tensors = self._tensors()
-        shapes: dict[str, tuple[int, ...]] = {name: tuple(x.shape) for name, x in tensors.items()} | {"optimizer/step": ()}
+        shapes: dict[str, tuple[int, ...]] = {name: tuple(x.shape) for name, x in tensors.items()} | {
+            "optimizer/step": ()
+        }
         problems = [f"missing {name}" for name in sorted(set(shapes) - set(state))]
         problems += [f"unexpected {name}" for name in sorted(set(state) - set(shapes))]
         for name in sorted(set(shapes).intersection(state)):
             if np.shape(state[name]) != shapes[name]:
                 problems.append(f"{name}: expected shape {list(shapes[name])}, got {list(np.shape(state[name]))}")
         if problems:
-            raise ValueError("the training state does not fit this configuration and these spaces: " + "; ".join(problems))
+            raise ValueError(
+                "the training state does not fit this configuration and these spaces: " + "; ".join(problems)
+            )
         for flat in (self._flat, self._second_moment, self._momentum, self._slow_flat):
             flat.zero_()  # the gaps between the tensors too
         for name, x in tensors.items():
@@ -178,15 +207,22 @@ class Learner:
         self._acting = None
         self._stopped = False
 
-    def _differentiate(self, batch: Arrays, seed: int) -> tuple[dict[str, Tensor], dict[str, Tensor], Tensor, dict[str, Any]]:
-        """(gradients, metrics, what clipping multiplied each gradient by [P], aux); the clipped gradients are in `_gradient`."""
+    def _differentiate(
+        self, batch: Arrays, seed: int
+    ) -> tuple[dict[str, Tensor], dict[str, Tensor], Tensor, dict[str, Any]]:
+        """(gradients, metrics, what clipping multiplied each gradient by [P], aux); the clipped gradients are in
+        `_gradient`."""
         config = self.config
         inputs = {name: self._to_device(x) for name, x in batch.items()}
         noise, return_range = self._train_noise(inputs, seed), (self._low, self._high)
-        by_name, total, aux = gradients(self.parameters.mapping(), self._slow_critic, return_range, inputs, noise, self.spaces, config)
+        by_name, total, aux = gradients(
+            self.parameters.mapping(), self._slow_critic, return_range, inputs, noise, self.spaces, config
+        )
         with torch.no_grad():
             self._layout.pack(by_name.values(), out=self._gradient)
-            norms, factors = clip_flat_gradients_(self._gradient, self._flat, self._layout, config.agc_clip, config.agc_epsilon)
+            norms, factors = clip_flat_gradients_(
+                self._gradient, self._flat, self._layout, config.agc_clip, config.agc_epsilon
+            )
             metrics = {
                 "loss/total": total,
                 **{f"loss/{name}": value for name, value in aux["losses"].items()},
@@ -198,7 +234,8 @@ class Learner:
         return by_name, metrics, factors, aux
 
     def _update(self, return_range: tuple[Tensor, Tensor]) -> Tensor:
-        """The whole training state takes the step of the clipped gradients. Returns the norm of what the parameters moved by."""
+        """The whole training state takes the step of the clipped gradients. Returns the norm of what the parameters
+        moved by."""
         config = self.config
         flat_step_(self._optimizer, self._flat, self._gradient, config)
         self._slow_flat.lerp_(self._critic_flat, 1 - config.slow_critic_decay)
@@ -208,7 +245,8 @@ class Learner:
         return torch.linalg.vector_norm(self._momentum) * (rate / (1 - config.beta1**self._step))
 
     def _tensors(self) -> dict[str, Tensor]:
-        """Everything in the training state but whole numbers, under canonical names; writing to a tensor changes the state."""
+        """Everything in the training state but whole numbers, under canonical names; writing to a tensor changes the
+        state."""
         trees = {
             "params/": self._layout.views(self._flat),
             "slow_critic/": self._slow_critic,
@@ -242,7 +280,9 @@ class Learner:
         parts = []
         for space in self.spaces.actions.values():
             draw = torch.rand if isinstance(space, Discrete) else torch.randn
-            parts.append(draw(*leading, *space.array_shape, generator=generator, dtype=self._dtype, device=self._device))
+            parts.append(
+                draw(*leading, *space.array_shape, generator=generator, dtype=self._dtype, device=self._device)
+            )
         return torch.cat(parts, -1)
 
     def _train_noise(self, batch: Mapping[str, Tensor], seed: int) -> dict[str, Tensor]:
@@ -269,9 +309,14 @@ def select_device(device: str | None) -> torch.device:
         raise ValueError(f"unknown device {device!r}; expected cpu, gpu, cuda, gpu:<number> or cuda:<number>")
     kind, index = match[1] or "cuda", match[2]
     if kind == "cuda" and int(index or 0) >= torch.cuda.device_count():
-        build = "a build for CPUs only" if torch.version.cuda is None and torch.version.hip is None else f"{torch.cuda.device_count()} GPUs"
+        build = (
+            "a build for CPUs only"
+            if torch.version.cuda is None and torch.version.hip is None
+            else f"{torch.cuda.device_count()} GPUs"
+        )
         raise ValueError(
-            f"device {device!r} is not there: PyTorch {torch.__version__} has {build}; use --device cpu or install a build for GPUs"
+            f"device {device!r} is not there: PyTorch {torch.__version__} has {build}; use "
+            f"--device cpu or install a build for GPUs"
         )
     return torch.device(kind, int(index)) if index else torch.device(kind)
 
@@ -296,7 +341,11 @@ class _Element:
         self._array, self._index = array, index
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
-        return np.asarray(self._array)[self._index : self._index + 1].reshape(()).astype(np.float64 if dtype is None else dtype)
+        return (
+            np.asarray(self._array)[self._index : self._index + 1]
+            .reshape(())
+            .astype(np.float64 if dtype is None else dtype)
+        )
 
     def __float__(self) -> float:
         return float(np.asarray(self._array)[self._index])

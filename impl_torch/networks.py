@@ -29,7 +29,8 @@ from spec.parameters import bottleneck
 
 Observations = Mapping[str, Tensor]
 Outputs = Mapping[str, Mapping[str, Tensor]]
-# Pixels that go through a convolutional network at a time on the CPU, so that what a layer hands to the next one stays in the cache.
+# Pixels that go through a convolutional network at a time on the CPU, so that what a layer hands to the next one stays
+# in the cache.
 CHUNK_PIXELS = 64 * 64 * 64
 
 
@@ -46,8 +47,12 @@ def encoder(params: Params, observations: Observations, spaces: Spaces, config: 
         bottleneck(config, spaces)  # refuses sides that cannot be halved
     tokens = []
     if spaces.vectors:
-        vector = torch.cat([encode_vector(observations[key], space, config) for key, space in spaces.vectors.items()], -1)
-        tokens.append(mlp(params, "encoder/vector", vector.to(compute_dtype(config)), config.encoder_layers, config.norm_epsilon))
+        vector = torch.cat(
+            [encode_vector(observations[key], space, config) for key, space in spaces.vectors.items()], -1
+        )
+        tokens.append(
+            mlp(params, "encoder/vector", vector.to(compute_dtype(config)), config.encoder_layers, config.norm_epsilon)
+        )
     if spaces.images:
         image = torch.cat([observations[key] for key in spaces.images], -1)
         x = image.flatten(0, -4) if image.ndim > 3 else image.unsqueeze(0)
@@ -60,7 +65,8 @@ def check_observations(observations: Observations, spaces: Spaces) -> None:
     """Names, dtypes and shapes. [NET-2] [NET-4] [NET-6] [NET-27]
 
     Raises:
-      ValueError: naming the key. Values of a Discrete are not looked at here: on an accelerator that would wait for the device.
+      ValueError: naming the key. Values of a Discrete are not looked at here: on an accelerator that would wait for the
+        device.
     """
     expect_keys("observations", observations, spaces.observations)
     leading = None
@@ -72,7 +78,9 @@ def check_observations(observations: Observations, spaces: Spaces) -> None:
         if isinstance(space, Image):
             expect(x.dtype == torch.uint8, f"observation {key!r}", "dtype uint8", x.dtype)
         elif isinstance(space, Discrete):
-            expect(not x.is_floating_point() and x.dtype != torch.bool, f"observation {key!r}", "an integer dtype", x.dtype)
+            expect(
+                not x.is_floating_point() and x.dtype != torch.bool, f"observation {key!r}", "an integer dtype", x.dtype
+            )
 
 
 def encode_vector(x: Tensor, space: Vector | Discrete, config: Config) -> Tensor:
@@ -93,7 +101,9 @@ def _in_chunks(network: functools.partial[Tensor], x: Tensor, pixels: int) -> Te
 
 def _encode_image(params: Params, image: Tensor, config: Config) -> Tensor:
     """[N, H, W, channels] uint8 -> [N, h0*w0*c0]. [NET-6] to [NET-10] [LAY-14]"""
-    x = ((image.to(wide_dtype(config)) - 127.5) / 255).to(compute_dtype(config))  # x/255 - 1/2 without the rounding of x/255
+    x = ((image.to(wide_dtype(config)) - 127.5) / 255).to(
+        compute_dtype(config)
+    )  # x/255 - 1/2 without the rounding of x/255
     for index in range(len(config.cnn_multipliers)):
         name = f"encoder/image/conv{index}"
         kernel, bias, scale = params[f"{name}/kernel"], params[f"{name}/bias"], params[f"{name}/scale"]
@@ -122,7 +132,9 @@ def decoder(params: Params, feature: Tensor, spaces: Spaces, config: Config) -> 
         image = next(iter(spaces.images.values()))
         network = functools.partial(_decode_image, params, spaces=spaces, config=config)
         pixels = _in_chunks(network, x.reshape(-1, x.shape[-1]), image.height * image.width)
-        parts = pixels.view(*x.shape[:-1], *pixels.shape[1:]).split([space.channels for space in spaces.images.values()], -1)
+        parts = pixels.view(*x.shape[:-1], *pixels.shape[1:]).split(
+            [space.channels for space in spaces.images.values()], -1
+        )
         outputs |= dict(zip(spaces.images, parts, strict=True))
     return {key: outputs[key] for key in spaces.observations}
 
@@ -166,7 +178,9 @@ def reward_head(params: Params, feature: Tensor, config: Config) -> Tensor:
 
 def continue_head(params: Params, feature: Tensor, config: Config) -> Tensor:
     """Logit of going on: [..., F] -> [...]. [NET-21] [NET-26]"""
-    return _out(params, "continue/out", _hidden(params, "continue", feature, config.continue_layers, config), config).squeeze(-1)
+    return _out(
+        params, "continue/out", _hidden(params, "continue", feature, config.continue_layers, config), config
+    ).squeeze(-1)
 
 
 def critic(params: Params, feature: Tensor, config: Config) -> Tensor:
@@ -175,7 +189,8 @@ def critic(params: Params, feature: Tensor, config: Config) -> Tensor:
 
 
 def actor(params: Params, feature: Tensor, spaces: Spaces, config: Config) -> dict[str, dict[str, Tensor]]:
-    """Raw outputs: [..., F] -> {key: {"logits": [..., sum of classes]} or {"mean": [..., size], "std": [..., size]}}. [NET-22] [NET-26]"""
+    """Raw outputs: [..., F] -> {key: {"logits": [..., sum of classes]} or {"mean": [..., size], "std": [..., size]}}.
+    [NET-22] [NET-26]"""
     x = _hidden(params, "actor", feature, config.actor_layers, config)
     return {
         key: {

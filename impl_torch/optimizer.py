@@ -1,7 +1,7 @@
 """AGC and LaProp. Chapter: spec/09-optimizer.md.
 
-`LaProp` is an ordinary `torch.optim.Optimizer`, and `clip_gradients_` works before any optimizer as `torch.nn.utils.clip_grad_norm_` does;
-both can be used alone. The functions of the chapter's names return new tensors.
+`LaProp` is an ordinary `torch.optim.Optimizer`, and `clip_gradients_` works before any optimizer as
+`torch.nn.utils.clip_grad_norm_` does; both can be used alone. The functions of the chapter's names return new tensors.
 """
 
 import math
@@ -16,7 +16,8 @@ from impl_torch.shapes import expect, expect_keys, expect_same_shape, expect_sha
 from spec import Config
 
 DEAD_ZONE = 1e-16  # [OPT-9]
-# Numbers that the CPU updates at a time: the whole chain of operations on them runs in the cache, not once through memory for each.
+# Numbers that the CPU updates at a time: the whole chain of operations on them runs in the cache, not once through
+# memory for each.
 CHUNK = 1 << 17
 
 
@@ -51,7 +52,9 @@ def clip_gradients_(parameters: Iterable[Tensor], clip: float, epsilon: float = 
 
 
 @torch.no_grad()
-def clip_flat_gradients_(gradients: Tensor, parameters: Tensor, layout: Layout, clip: float, epsilon: float) -> tuple[Tensor, Tensor]:
+def clip_flat_gradients_(
+    gradients: Tensor, parameters: Tensor, layout: Layout, clip: float, epsilon: float
+) -> tuple[Tensor, Tensor]:
     """The same for all tensors of a flat buffer at once, in place. [OPT-2]
 
     gradients, parameters [total]. Returns the norm of each tensor's gradient before clipping [P] and the factors [P].
@@ -63,7 +66,8 @@ def clip_flat_gradients_(gradients: Tensor, parameters: Tensor, layout: Layout, 
 
 
 def _norms(rows: Tensor, layout: Layout) -> Tensor:
-    """Norm of each tensor [P], float64, from the rows of a flat buffer [R, ROW]: of its rows, of the norms of its rows, and so on."""
+    """Norm of each tensor [P], float64, from the rows of a flat buffer [R, ROW]: of its rows, of the norms of its rows,
+    and so on."""
     pieces = rows.split(CHUNK // ROW) if rows.device.type == "cpu" else [rows]
     norms = torch.cat([_row_norms(piece) for piece in pieces])
     for size, places in layout.folds(rows.device):
@@ -91,7 +95,9 @@ def _correction(beta: float, step: int) -> float:
     return -math.expm1((step + 1) * math.log(beta)) if beta else 1.0
 
 
-def _laprop_(tensors: tuple[Tensor, Tensor, Tensor, Tensor], step: int, betas: tuple[float, float], epsilon: float, rate: float) -> None:
+def _laprop_(
+    tensors: tuple[Tensor, Tensor, Tensor, Tensor], step: int, betas: tuple[float, float], epsilon: float, rate: float
+) -> None:
     """Updates both moments in place and subtracts rate * update from `out`; all of one shape. [OPT-8] to [OPT-12]
 
     tensors: gradient, second moment, momentum, out.
@@ -108,25 +114,31 @@ def _laprop_(tensors: tuple[Tensor, Tensor, Tensor, Tensor], step: int, betas: t
 
 
 @torch.no_grad()
-def laprop(gradient: Tensor, second_moment: Tensor, momentum: Tensor, step: int, config: Config) -> tuple[Tensor, Tensor, Tensor]:
+def laprop(
+    gradient: Tensor, second_moment: Tensor, momentum: Tensor, step: int, config: Config
+) -> tuple[Tensor, Tensor, Tensor]:
     """(update, new second moment, new momentum), without learning rate and sign; any shape. [OPT-8] to [OPT-14]"""
     expect_same_shape(gradient=gradient, second_moment=second_moment, momentum=momentum)
     second_moment, momentum, update = second_moment.clone(), momentum.clone(), torch.zeros_like(momentum)
-    _laprop_((gradient, second_moment, momentum, update), step, (config.beta1, config.beta2), config.laprop_epsilon, -1.0)
+    _laprop_(
+        (gradient, second_moment, momentum, update), step, (config.beta1, config.beta2), config.laprop_epsilon, -1.0
+    )
     return update, second_moment, momentum
 
 
 class LaProp(torch.optim.Optimizer):
     """LaProp: RMSProp's normalization first, momentum afterwards. [OPT-8] to [OPT-16] [OPT-20]
 
-    Per parameter the state is "step" (int), "second_moment" and "momentum", in float32 or better also for narrower parameters. [OPT-19]
-    No weight decay, and no clipping: see `clip_gradients_`.
+    Per parameter the state is "step" (int), "second_moment" and "momentum", in float32 or better also for narrower
+    parameters. [OPT-19] No weight decay, and no clipping: see `clip_gradients_`.
 
     Raises:
       ValueError: a beta outside [0, 1).
     """
 
-    def __init__(self, params: Any, lr: float = 4e-5, betas: tuple[float, float] = (0.9, 0.99), eps: float = 1e-20) -> None:
+    def __init__(
+        self, params: Any, lr: float = 4e-5, betas: tuple[float, float] = (0.9, 0.99), eps: float = 1e-20
+    ) -> None:
         for beta in betas:
             _correction(beta, 0)
         super().__init__(params, {"lr": lr, "betas": betas, "eps": eps})
@@ -147,7 +159,9 @@ class LaProp(torch.optim.Optimizer):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """As that of any optimizer, which would round the moments to the dtype of the parameters."""
         super().load_state_dict(state_dict)
-        saved = (state_dict["state"].get(index, {}) for group in state_dict["param_groups"] for index in group["params"])
+        saved = (
+            state_dict["state"].get(index, {}) for group in state_dict["param_groups"] for index in group["params"]
+        )
         parameters = (parameter for group in self.param_groups for parameter in group["params"])
         for parameter, state in zip(parameters, saved, strict=True):
             for name in {"second_moment", "momentum"} & set(state):
@@ -157,7 +171,10 @@ class LaProp(torch.optim.Optimizer):
         state = self.state[parameter]
         if not state:
             dtype = torch.promote_types(parameter.dtype, torch.float32)
-            state |= {"step": 0, **{name: torch.zeros_like(parameter, dtype=dtype) for name in ("second_moment", "momentum")}}
+            state |= {
+                "step": 0,
+                **{name: torch.zeros_like(parameter, dtype=dtype) for name in ("second_moment", "momentum")},
+            }
         tensors = (gradient.to(state["momentum"].dtype), state["second_moment"], state["momentum"], parameter)
         chunks: Iterable[Any] = _chunks(*tensors) if parameter.device.type == "cpu" else [tensors]
         for chunk in chunks:
@@ -185,8 +202,14 @@ def optimizer_step(
         expect_keys(what, tree, params, exactly=True)
         for name, x in params.items():
             expect_shape(f"{what}[{name!r}]", tree[name], x.shape)
-    layout, dtype, step = Layout({name: tuple(x.shape) for name, x in params.items()}), wide_dtype(config), int(state["step"])
-    flat, gradient, second_moment, momentum = (layout.pack(tree[name].to(dtype) for name in params) for tree in (params, *trees.values()))
+    layout, dtype, step = (
+        Layout({name: tuple(x.shape) for name, x in params.items()}),
+        wide_dtype(config),
+        int(state["step"]),
+    )
+    flat, gradient, second_moment, momentum = (
+        layout.pack(tree[name].to(dtype) for name in params) for tree in (params, *trees.values())
+    )
     optimizer = flat_optimizer(flat, second_moment, momentum, step, config)
     clip_flat_gradients_(gradient, flat, layout, config.agc_clip, config.agc_epsilon)
     flat_step_(optimizer, flat, gradient, config)

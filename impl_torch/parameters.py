@@ -1,9 +1,9 @@
 """The parameter table in memory: one flat buffer, and an `nn.Module` whose parameters are views of it.
 
-Why flat: the optimizer and the slow critic then are a handful of operations on long vectors instead of a few on each of a hundred
-tensors, without PyTorch's private `_foreach` functions. Why one module whose parameter names hold slashes, and not a tree of modules:
-`state_dict()` is the canonical table as it stands, and a task may call its action "forward" or "type", which no child of an `nn.Module`
-can be called.
+Why flat: the optimizer and the slow critic then are a handful of operations on long vectors instead of a few on each of
+a hundred tensors, without PyTorch's private `_foreach` functions. Why one module whose parameter names hold slashes,
+and not a tree of modules: `state_dict()` is the canonical table as it stands, and a task may call its action "forward"
+or "type", which no child of an `nn.Module` can be called.
 """
 
 import math
@@ -32,7 +32,10 @@ class Layout:
     def views(self, flat: Tensor) -> dict[str, Tensor]:
         """name -> its part of flat [total] in its own shape, the same memory."""
         pieces = flat.split([ROW * rows for rows in self.rows.values()])
-        return {name: piece[: self.sizes[name]].view(self.shapes[name]) for name, piece in zip(self.shapes, pieces, strict=True)}
+        return {
+            name: piece[: self.sizes[name]].view(self.shapes[name])
+            for name, piece in zip(self.shapes, pieces, strict=True)
+        }
 
     def pack(self, tensors: Iterable[Tensor], out: Tensor | None = None) -> Tensor:
         """One flat buffer [total] out of all tensors, in the order of the names; a new one, or `out`."""
@@ -50,10 +53,11 @@ class Layout:
         return self._owners[device]
 
     def folds(self, device: torch.device) -> list[tuple[int, Tensor]]:
-        """How to get from one number for each row to one number for each tensor, a row of numbers becoming one each time.
+        """How to get from one number for each row to one number for each tensor, a row of numbers becoming one each
+        time.
 
-        A fold is the size of a buffer and the places in it of the numbers; its other places hold zeros. Unlike a sum by owners, which
-        adds in any order on a GPU, this always gives the same sum.
+        A fold is the size of a buffer and the places in it of the numbers; its other places hold zeros. Unlike a sum by
+        owners, which adds in any order on a GPU, this always gives the same sum.
         """
         if device not in self._folds:
             self._folds[device], layout = [], self

@@ -1,4 +1,5 @@
-"""Returns: what actor and critic learn from. Chapter: spec/07-returns.md. Plain arithmetic, constant in every gradient ([RET-18])."""
+"""Returns: what actor and critic learn from. Chapter: spec/07-returns.md. Plain arithmetic, constant in every gradient
+([RET-18])."""
 
 import math
 
@@ -16,7 +17,8 @@ def _check(least: int, first: str, **arrays: Tensor) -> None:
 
 
 def _backwards(offset: Tensor, slope: Tensor, last: Tensor) -> Tensor:
-    """R[:, t] = offset[:, t] + slope[:, t] * R[:, t + 1] with R behind the end = last: [N, H] twice and [N] -> [N, H]."""
+    """R[:, t] = offset[:, t] + slope[:, t] * R[:, t + 1] with R behind the end = last: [N, H] twice and [N] -> [N,
+    H]."""
     results = []
     for a, b in zip(reversed(offset.unbind(1)), reversed(slope.unbind(1)), strict=True):
         last = torch.addcmul(a, b, last)
@@ -26,7 +28,8 @@ def _backwards(offset: Tensor, slope: Tensor, last: Tensor) -> Tensor:
 
 @torch.no_grad()
 def lambda_return(reward: Tensor, continue_: Tensor, value: Tensor, discount: float, lambda_: float) -> Tensor:
-    """Imagined λ-returns, all with arrival indices: [N, H+1] three times -> [N, H]. [RET-1] [RET-2] [RET-17] [RET-19] [RET-20]"""
+    """Imagined λ-returns, all with arrival indices: [N, H+1] three times -> [N, H]. [RET-1] [RET-2] [RET-17] [RET-19]
+    [RET-20]"""
     _check(2, "reward", reward=reward, continue_=continue_, value=value)
     reward, continue_, value = (widen(x)[:, 1:] for x in (reward, continue_, value))
     discounts = discount * continue_
@@ -37,7 +40,8 @@ def lambda_return(reward: Tensor, continue_: Tensor, value: Tensor, discount: fl
 def replay_lambda_return(
     reward: Tensor, is_last: Tensor, is_terminal: Tensor, annotation: Tensor, discount: float, lambda_: float
 ) -> Tensor:
-    """λ-returns of replayed sequences with true flags: [B, T] four times -> [B, T-1]. [RET-9] [RET-10] [RET-17] [RET-19] [RET-20]"""
+    """λ-returns of replayed sequences with true flags: [B, T] four times -> [B, T-1]. [RET-9] [RET-10] [RET-17]
+    [RET-19] [RET-20]"""
     _check(1, "reward", reward=reward, is_last=is_last, is_terminal=is_terminal, annotation=annotation)
     annotation = widen(annotation)
     reward, is_last, is_terminal = (x.to(annotation.dtype)[:, 1:] for x in (reward, is_last, is_terminal))
@@ -55,7 +59,8 @@ def cumulative_weights(continue_: Tensor, discount: float) -> Tensor:
 
 @torch.no_grad()
 def percentile(values: Tensor, q: float) -> Tensor:
-    """The q-th percentile of all values, interpolated linearly: [...] -> scalar, NaN if any value is NaN. [RET-12] [RET-13]"""
+    """The q-th percentile of all values, interpolated linearly: [...] -> scalar, NaN if any value is NaN. [RET-12]
+    [RET-13]"""
     return _percentile(widen(values).flatten().sort().values, q)
 
 
@@ -71,7 +76,8 @@ def _percentile(ordered: Tensor, q: float) -> Tensor:
 
 @torch.no_grad()
 def update_return_range(low: Tensor, high: Tensor, returns: Tensor, config: Config) -> tuple[Tensor, Tensor]:
-    """Moves both averages towards the percentiles of all imagined returns [N, H]; scalars. [RET-14] [RET-15] [RET-17]"""
+    """Moves both averages towards the percentiles of all imagined returns [N, H]; scalars. [RET-14] [RET-15]
+    [RET-17]"""
     ordered = widen(returns).flatten().sort().values
     decay = config.return_decay
     return (

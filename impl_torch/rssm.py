@@ -1,7 +1,7 @@
 """The recurrent state-space model. Chapter: spec/04-rssm.md.
 
-A state is {"deter" [N, D], "stoch" [N, S, C]}. Functions take the flat mapping of parameters; `prepare` rearranges them once, which every
-function does for itself where its caller has not.
+A state is {"deter" [N, D], "stoch" [N, S, C]}. Functions take the flat mapping of parameters; `prepare` rearranges them
+once, which every function does for itself where its caller has not.
 """
 
 from collections.abc import Callable, Mapping
@@ -24,8 +24,8 @@ SHARED, BLOCK = "rssm/hidden/shared", "rssm/hidden/block"
 def prepare(params: Params, config: Config) -> Params:
     """The parameters with the kernel of rssm/hidden split in two; doing it twice changes nothing.
 
-    Every block of rssm/hidden reads its own memory and the same three embeddings ([RSSM-4]). For the embeddings the kernels of all blocks
-    side by side make one dense product, instead of one over G copies of the embeddings.
+    Every block of rssm/hidden reads its own memory and the same three embeddings ([RSSM-4]). For the embeddings the
+    kernels of all blocks side by side make one dense product, instead of one over G copies of the embeddings.
     """
     if SHARED in params or "rssm/hidden/kernel" not in params:
         return params
@@ -37,18 +37,23 @@ def freeze(params: Params, config: Config) -> Params:
     """The same, as constants with kernels in the compute dtype: for many calls without gradients."""
     with torch.no_grad():
         prepared = prepare(params, config)
-        return {name: x.detach().to(compute_dtype(config)) if x.ndim > 1 else x.detach() for name, x in prepared.items()}
+        return {
+            name: x.detach().to(compute_dtype(config)) if x.ndim > 1 else x.detach() for name, x in prepared.items()
+        }
 
 
 def core(params: Params, deter: Tensor, stoch: Tensor, action: Tensor, config: Config) -> Tensor:
-    """The memory update: [..., D], [..., S, C], [..., A] -> [..., D]. [RSSM-1] to [RSSM-7] [RSSM-24] [RSSM-26] [RSSM-27]"""
+    """The memory update: [..., D], [..., S, C], [..., A] -> [..., D]. [RSSM-1] to [RSSM-7] [RSSM-24] [RSSM-26]
+    [RSSM-27]"""
     expect_last("deter", deter, config.deter)
     expect_shape("stoch", stoch, (*deter.shape[:-1], config.stoch, config.classes))
     expect_shape("action", action, (*deter.shape[:-1], params["rssm/embed_action/kernel"].shape[0]))
     params, dtype, epsilon = prepare(params, config), compute_dtype(config), config.norm_epsilon
     deter, stoch, action = deter.to(dtype), stoch.flatten(-2).to(dtype), _bounded(action.to(dtype))
     inputs = {"rssm/embed_deter": deter, "rssm/embed_stoch": stoch, "rssm/embed_action": action}
-    embedded = torch.stack([linear(x, params[f"{name}/kernel"], params[f"{name}/bias"]) for name, x in inputs.items()], -2)
+    embedded = torch.stack(
+        [linear(x, params[f"{name}/kernel"], params[f"{name}/bias"]) for name, x in inputs.items()], -2
+    )
     scale = torch.stack([params[f"{name}/scale"] for name in inputs])
     embedded = norm_silu(embedded, scale, epsilon).flatten(-2)
     hidden = linear(embedded, params[SHARED], params["rssm/hidden/bias"]).add_(block_linear(deter, params[BLOCK], None))
@@ -70,7 +75,8 @@ def prior(params: Params, deter: Tensor, config: Config) -> Tensor:
 
 
 def posterior(params: Params, deter: Tensor, tokens: Tensor, config: Config) -> Tensor:
-    """Logits of z given memory and tokens, before the mixture: [..., D], [..., E] -> [..., S, C]. [RSSM-9] [RSSM-10] [RSSM-26]"""
+    """Logits of z given memory and tokens, before the mixture: [..., D], [..., E] -> [..., S, C]. [RSSM-9] [RSSM-10]
+    [RSSM-26]"""
     expect_last("deter", deter, config.deter)
     expect_shape("tokens", tokens, (*deter.shape[:-1], _token_size(params, config)))
     x = torch.cat([deter, tokens], -1).to(compute_dtype(config))
@@ -101,7 +107,9 @@ def observe_step(
     expect_shape("uniform", uniform, (rows, config.stoch))
     params, dtype = prepare(params, config), compute_dtype(config)
     first = is_first.bool()
-    deter, stoch, action = (x.to(dtype).masked_fill(first.view(-1, *[1] * (x.ndim - 1)), 0) for x in (deter, stoch, prev_action))
+    deter, stoch, action = (
+        x.to(dtype).masked_fill(first.view(-1, *[1] * (x.ndim - 1)), 0) for x in (deter, stoch, prev_action)
+    )
     deter = core(params, deter, stoch, action, config)
     logits = posterior(params, deter, tokens, config)
     log_probs = unimix_log_probs(logits, config.latent_unimix)
@@ -126,8 +134,8 @@ def observe(
     expect_shape("uniform", uniform, (*shape, config.stoch))
     params, dtype, epsilon = prepare(params, config), compute_dtype(config), config.norm_epsilon
 
-    # What does not depend on the recurrent state leaves the loop: the action's embedding with its share of rssm/hidden, and the tokens'
-    # share of the posterior's first layer.
+    # What does not depend on the recurrent state leaves the loop: the action's embedding with its share of rssm/hidden,
+    # and the tokens' share of the posterior's first layer.
     first = is_first.bool().t()
     action = prev_action.to(dtype).transpose(0, 1).masked_fill(first.unsqueeze(-1), 0)
     action = dense(params, "rssm/embed_action", _bounded(action), epsilon)
@@ -176,7 +184,9 @@ def imagine(params: Params, carry: Carry, policy: Policy, uniform: Tensor, confi
 
 
 @torch.no_grad()
-def imagine_features(params: Params, carry: Carry, policy: Policy, uniform: Tensor, config: Config) -> tuple[list[Tensor], list[Tensor]]:
+def imagine_features(
+    params: Params, carry: Carry, policy: Policy, uniform: Tensor, config: Config
+) -> tuple[list[Tensor], list[Tensor]]:
     """`imagine` as lists over time: H+1 features [N, F], which is what the heads read, and H actions [N, A]."""
     deter, stoch = _check_carry(carry, config)
     expect(uniform.ndim == 3, "uniform", "shape [N, H, S]", list(uniform.shape))
@@ -195,6 +205,11 @@ def imagine_features(params: Params, carry: Carry, policy: Policy, uniform: Tens
 
 def _check_carry(carry: Carry, config: Config) -> tuple[Tensor, Tensor]:
     deter, stoch = carry["deter"], carry["stoch"]
-    expect(deter.ndim == 2 and deter.shape[1] == config.deter, "carry['deter']", f"shape [N, {config.deter}]", list(deter.shape))
+    expect(
+        deter.ndim == 2 and deter.shape[1] == config.deter,
+        "carry['deter']",
+        f"shape [N, {config.deter}]",
+        list(deter.shape),
+    )
     expect_shape("carry['stoch']", stoch, (len(deter), config.stoch, config.classes))
     return deter, stoch

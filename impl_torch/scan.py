@@ -1,9 +1,10 @@
 """The recurrence over an observed sequence, with a backward pass written by hand.
 
-The steps follow each other, so what must be done inside the loop decides the speed. Autograd would run every step's products backward for
-the kernels too: T times it would write and add up gradients as large as the parameters, each from a few rows. Here the loop back carries
-only the gradient of the state. Every factor that does not depend on it is computed for all steps at once before the loop, and the gradient
-of each kernel is one product over all steps after it. The values are those of `rssm.observe_step`.
+The steps follow each other, so what must be done inside the loop decides the speed. Autograd would run every step's
+products backward for the kernels too: T times it would write and add up gradients as large as the parameters, each from
+a few rows. Here the loop back carries only the gradient of the state. Every factor that does not depend on it is
+computed for all steps at once before the loop, and the gradient of each kernel is one product over all steps after it.
+The values are those of `rssm.observe_step`.
 
 Everything here is time-major. T steps, B rows, D = deter, Z = stoch * classes, G blocks, d = units.
 """
@@ -21,7 +22,8 @@ from impl_torch.shapes import widen
 
 @dataclasses.dataclass(frozen=True)
 class ScanWeights:
-    """What the loop reads. It converts them to the compute dtype itself, so that their gradients are not rounded to it."""
+    """What the loop reads. It converts them to the compute dtype itself, so that their gradients are not rounded to
+    it."""
 
     embed_deter: Tensor  # [D, d]
     embed_stoch: Tensor  # [Z, d]
@@ -58,12 +60,18 @@ class ScanOptions:
 
 
 def scan(
-    options: ScanOptions, carry: Tensor, is_first: Tensor, uniform: Tensor, action_drive: Tensor, token_drive: Tensor, weights: ScanWeights
+    options: ScanOptions,
+    carry: Tensor,
+    is_first: Tensor,
+    uniform: Tensor,
+    action_drive: Tensor,
+    token_drive: Tensor,
+    weights: ScanWeights,
 ) -> tuple[Tensor, Tensor]:
     """Runs the sequence.
 
-    carry [B, D + Z]: a constant; is_first [T, B] bool; uniform [T, B, S]; action_drive [T, B, D]: what the action and the bias add to
-    rssm/hidden; token_drive [T, B, d]: what the tokens and the bias add to the posterior's first layer.
+    carry [B, D + Z]: a constant; is_first [T, B] bool; uniform [T, B, S]; action_drive [T, B, D]: what the action and
+    the bias add to rssm/hidden; token_drive [T, B, d]: what the tokens and the bias add to the posterior's first layer.
     Returns the features [T, B, D + Z] in the compute dtype and the posterior logits [T, B, S, C] in float32 or better.
     """
     return _Scan.apply(options, carry, is_first, uniform, action_drive, token_drive, *weights.flat())
@@ -103,7 +111,8 @@ def _gate_slopes(gates: Tensor, deter: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _tanh_(x: Tensor) -> Tensor:
-    """tanh in place, to an error that is small beside 1 (not beside x): on the CPU, PyTorch's own takes five times as long."""
+    """tanh in place, to an error that is small beside 1 (not beside x): on the CPU, PyTorch's own takes five times as
+    long."""
     return x.tanh_() if x.dtype == torch.float64 or x.device.type != "cpu" else x.mul_(2).sigmoid_().mul_(2).sub_(1)
 
 
@@ -129,7 +138,10 @@ class _Scan(torch.autograd.Function):
         T, B, D = action_drive.shape
         G, Z, S, units = len(w.block), w.out.shape[1], options.stoch, w.out.shape[0]
         new = action_drive.new_empty
-        states, features = new(T, B, D + Z), new(T, B, D + Z)  # what a step starts from, after resets, and what it ends with
+        states, features = (
+            new(T, B, D + Z),
+            new(T, B, D + Z),
+        )  # what a step starts from, after resets, and what it ends with
         embed, embedded = new(T, B, 2, units), new(T, B, 2 * units)
         hidden, activated = new(T, B, D), new(T, G, B, D // G)
         gates = new(T, G, B, 3, D // G)
@@ -185,7 +197,9 @@ class _Scan(torch.autograd.Function):
             straight = by_feature[:, D:].view_as(mixed[t]) * mixed[t]
             by_out[t] += straight.addcmul_(softmax[t], straight.sum(-1, keepdim=True), value=-1)
             upstream = by_out[t].flatten(1).to(hidden.dtype)
-            for back, by_pre, kernel in zip(reversed(back_post), reversed(by_post), reversed(post_kernels), strict=True):
+            for back, by_pre, kernel in zip(
+                reversed(back_post), reversed(by_post), reversed(post_kernels), strict=True
+            ):
                 torch.mm(upstream, kernel.t(), out=back.upstream[t])
                 upstream = back.step(t, by_pre[t])
             by_memory = torch.addmm(by_feature[:, :D], upstream, w.post_deter.t())
@@ -227,7 +241,8 @@ class _Scan(torch.autograd.Function):
 
 
 class _NormSiluBack:
-    """The way back through silu(rms_norm(x)) at every step of x [T, ..., n]: a step does only what needs its gradient."""
+    """The way back through silu(rms_norm(x)) at every step of x [T, ..., n]: a step does only what needs its
+    gradient."""
 
     def __init__(self, x: Tensor, scale: Tensor, epsilon: float) -> None:
         self.normal, inverse = normalize(x, epsilon)

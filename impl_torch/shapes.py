@@ -1,4 +1,5 @@
-"""Errors that name the argument, what was expected and what came ([CON-8]), and the precisions of a configuration ([CON-23])."""
+"""Errors that name the argument, what was expected and what came ([CON-8]), and the precisions of a configuration
+([CON-23])."""
 
 from collections.abc import Iterable, Mapping
 

@@ -25,7 +25,8 @@ def symexp(x: Tensor) -> Tensor:
 
 @functools.cache
 def exponential_bins(bins: int) -> np.ndarray:
-    """`bins` positions [bins], NumPy float64 (do not write to it): symexp of even steps from -20 to 20, exactly antisymmetric.
+    """`bins` positions [bins], NumPy float64 (do not write to it): symexp of even steps from -20 to 20, exactly
+    antisymmetric.
 
     [TRA-5] [TRA-6]
 
@@ -66,7 +67,9 @@ def twohot_sparse(x: Tensor, bins: Bins) -> tuple[Tensor, Tensor]:
     x = widen(x).detach()
     bins = torch.as_tensor(bins, dtype=x.dtype, device=x.device)
     x = torch.minimum(torch.maximum(x, bins[0]), bins[-1])
-    lower = (torch.searchsorted(bins, x, right=True) - 1).clamp(0, len(bins) - 2)  # a search puts NaN behind the last bin
+    lower = (torch.searchsorted(bins, x, right=True) - 1).clamp(
+        0, len(bins) - 2
+    )  # a search puts NaN behind the last bin
     indices = torch.stack([lower, lower + 1], -1)
     low, high = bins[indices].unbind(-1)
     return indices, torch.stack([high - x, x - low], -1) / (high - low).unsqueeze(-1)
@@ -80,11 +83,17 @@ def ordered_expectation(probs: Tensor, bins: Bins) -> Tensor:
     Raises:
       ValueError: bins that are not one-dimensional, fewer than 3 or even in number, or probs of another length.
     """
-    expect(bins.ndim == 1 and len(bins) >= 3 and len(bins) % 2 == 1, "bins", "shape [K] with odd K of at least 3", list(bins.shape))
+    expect(
+        bins.ndim == 1 and len(bins) >= 3 and len(bins) % 2 == 1,
+        "bins",
+        "shape [K] with odd K of at least 3",
+        list(bins.shape),
+    )
     expect_last("probs", probs, len(bins))
     probs = widen(probs)
     bins = torch.as_tensor(bins, dtype=probs.dtype, device=probs.device)
     center = len(bins) // 2
-    # The difference of each mirrored pair comes first: equal probabilities cancel before they meet a huge number, however sums are fused.
+    # The difference of each mirrored pair comes first: equal probabilities cancel before they meet a huge number,
+    # however sums are fused.
     difference = probs[..., center + 1 :] - probs[..., :center].flip(-1)
     return (difference * bins[center + 1 :]).sum(-1) + probs[..., center] * bins[center]

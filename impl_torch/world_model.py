@@ -34,7 +34,8 @@ def continue_target(is_terminal: Tensor, config: Config) -> Tensor:
 
 
 def kl_losses(posterior_logits: Tensor, prior_logits: Tensor, config: Config) -> tuple[Tensor, Tensor]:
-    """Dynamics and representation loss in nats, at least free_nats: [..., S, C] twice -> [...] twice. [WM-9] to [WM-14]"""
+    """Dynamics and representation loss in nats, at least free_nats: [..., S, C] twice -> [...] twice. [WM-9] to
+    [WM-14]"""
     expect_same_shape(posterior_logits=posterior_logits, prior_logits=prior_logits)
     posterior = unimix_log_probs(posterior_logits, config.latent_unimix)
     prior = unimix_log_probs(prior_logits.to(posterior.dtype), config.latent_unimix)
@@ -43,8 +44,11 @@ def kl_losses(posterior_logits: Tensor, prior_logits: Tensor, config: Config) ->
     return dynamics.clamp(min=config.free_nats), representation.clamp(min=config.free_nats)
 
 
-def reconstruction_losses(predictions: Observations, observations: Observations, spaces: Spaces, config: Config) -> dict[str, Tensor]:
-    """{key: [...]} from the decoder's output and the raw observations. [WM-2] [WM-3] [WM-4] [WM-5] [WM-17] [WM-18] [WM-19]"""
+def reconstruction_losses(
+    predictions: Observations, observations: Observations, spaces: Spaces, config: Config
+) -> dict[str, Tensor]:
+    """{key: [...]} from the decoder's output and the raw observations. [WM-2] [WM-3] [WM-4] [WM-5] [WM-17] [WM-18]
+    [WM-19]"""
     expect_keys("predictions", predictions, spaces.observations)
     check_observations(observations, spaces)
     losses = {}
@@ -59,7 +63,8 @@ def reconstruction_losses(predictions: Observations, observations: Observations,
         else:
             entries = zip(prediction.split(space.classes, -1), target.unbind(-1), space.classes, strict=True)
             log_probs = [
-                categorical_log_prob(unimix_log_probs(logits, 0.0), F.one_hot(value.long(), classes)) for logits, value, classes in entries
+                categorical_log_prob(unimix_log_probs(logits, 0.0), F.one_hot(value.long(), classes))
+                for logits, value, classes in entries
             ]
             losses[key] = -torch.stack(log_probs).sum(0)
     return losses
@@ -102,7 +107,8 @@ def open_loop(
     spaces: Spaces,
     config: Config,
 ) -> dict[str, Tensor]:
-    """{key: [B, T, ...]} in the observations' own units, probabilities for a Discrete, with "reward" and "continue_" [B, T].
+    """{key: [B, T, ...]} in the observations' own units, probabilities for a Discrete, with "reward" and "continue_"
+    [B, T].
 
     [WM-20] [WM-21] [WM-22] [WM-23] [WM-24]
     observation {key: [B, T, ...]}, read up to `context`; prev_action [B, T, A]; is_first [B, T];

@@ -44,16 +44,20 @@ Params = Mapping[str, Any]
 
 
 def initial_parameters(table: Mapping[str, Parameter], uniforms: Mapping[str, Any]) -> dict[str, Array]:
-    """Fresh parameters as a function of uniform numbers. Implements [AGT-3] to [AGT-6], [LAY-9]; paper: Critic learning.
+    """Fresh parameters as a function of uniform numbers. Implements [AGT-3] to [AGT-6], [LAY-9]; paper: Critic
+    learning.
 
     Args:
       table: name -> Parameter, from `spec.parameters.parameter_table`.
-      uniforms: name -> numbers in [0, 1) in the parameter's shape, for exactly the entries with initializer "truncated_normal".
+      uniforms: name -> numbers in [0, 1) in the parameter's shape, for exactly the entries with initializer
+        "truncated_normal".
 
     Raises:
       ValueError: a name is missing or too many, or a shape differs.
     """
-    _same_names("uniforms", uniforms, {name for name, entry in table.items() if entry.initializer == "truncated_normal"})
+    _same_names(
+        "uniforms", uniforms, {name for name, entry in table.items() if entry.initializer == "truncated_normal"}
+    )
     params = {}
     for name, entry in table.items():
         if entry.initializer == "truncated_normal":
@@ -71,7 +75,8 @@ def initial_state(params: Params) -> dict[str, Any]:
       params: name -> array.
 
     Returns:
-      {"params", "slow_critic": name -> array, "optimizer": {"step", "second_moment", "momentum"}, "return_range": {"low", "high"}}.
+      {"params", "slow_critic": name -> array, "optimizer": {"step", "second_moment", "momentum"}, "return_range":
+      {"low", "high"}}.
     """
     params = {name: np.array(value, np.float64) for name, value in params.items()}
     return {
@@ -99,7 +104,11 @@ def flatten_state(state: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
         "optimizer/momentum": state["optimizer"]["momentum"],
         "return_range": state["return_range"],
     }
-    flat = {f"{group}/{name}": np.array(value, np.float32) for group, entries in groups.items() for name, value in entries.items()}
+    flat = {
+        f"{group}/{name}": np.array(value, np.float32)
+        for group, entries in groups.items()
+        for name, value in entries.items()
+    }
     return {**flat, "optimizer/step": np.array(state["optimizer"]["step"], np.int64)}
 
 
@@ -116,7 +125,11 @@ def unflatten_state(arrays: Mapping[str, Any], table: Mapping[str, Parameter]) -
         require_shape(f"checkpoint[{name!r}]", np.shape(arrays[name]), *shape)
 
     def group(prefix: str) -> dict[str, Array]:
-        return {name.removeprefix(prefix): np.array(arrays[name], np.float64) for name in expected if name.startswith(prefix)}
+        return {
+            name.removeprefix(prefix): np.array(arrays[name], np.float64)
+            for name in expected
+            if name.startswith(prefix)
+        }
 
     return {
         "params": group("params/"),
@@ -141,7 +154,8 @@ def policy_step(
     config: Config,
     mode: bool = False,
 ) -> tuple[dict[str, Array], Array]:
-    """One observation of each row in, one action of each row out. Implements [AGT-11] to [AGT-13], [LOOP-71]; paper: Critic learning.
+    """One observation of each row in, one action of each row out. Implements [AGT-11] to [AGT-13], [LOOP-71]; paper:
+    Critic learning.
 
     Args:
       carry: {"deter" [N, D], "stoch" [N, S, C]}.
@@ -163,7 +177,9 @@ def policy_step(
     tokens = networks.encoder(params, observation, spaces, config)
     carry, _ = observe_step(params, carry, tokens, prev_action, is_first, noise["posterior"], config)
     outputs = networks.actor(params, networks.feature(carry["deter"], carry["stoch"]), spaces, config)
-    return dict(carry), mode_action(outputs, spaces, config) if mode else sample_action(outputs, noise["action"], spaces, config)
+    return dict(carry), mode_action(outputs, spaces, config) if mode else sample_action(
+        outputs, noise["action"], spaces, config
+    )
 
 
 def losses(
@@ -180,12 +196,13 @@ def losses(
     Args:
       params, slow_critic: name -> array.
       return_range: moving averages (low, high) before this step.
-      batch: as replay gives it: observations [B, T, ...], reward, is_first, is_last, is_terminal [B, T], prev_action [B, T, A], and
-        the latents of the context step: deter [B, D], stoch [B, S] class indices.
+      batch: as replay gives it: observations [B, T, ...], reward, is_first, is_last, is_terminal [B, T], prev_action
+        [B, T, A], and the latents of the context step: deter [B, D], stoch [B, S] class indices.
       noise: {"posterior" [B, T, S], "prior" [N, H, S], "action" [N, H, K]} with N = B*T.
 
     Returns:
-      The total, and aux: "losses" (name -> mean), "return_range" (low, high), "deter" [B, T, D], "stoch" [B, T, S, C], "metrics".
+      The total, and aux: "losses" (name -> mean), "return_range" (low, high), "deter" [B, T, D], "stoch" [B, T, S, C],
+        "metrics".
 
     Raises:
       ValueError: an array of the batch or the noise has another shape.
@@ -244,8 +261,13 @@ def losses(
             batch["reward"], batch["is_last"], batch["is_terminal"], annotation, config.discount, config.return_lambda
         )
         replayed = networks.feature(states["deter"], states["stoch"])[:, :-1]
-        logits, slow_logits = networks.critic(params, replayed, config), networks.critic(slow_critic, stop_gradient(replayed), config)
-        elements["replay_critic"] = replay_critic_loss(logits, slow_logits, targets, np.asarray(batch["is_last"])[:, :-1], config)
+        logits, slow_logits = (
+            networks.critic(params, replayed, config),
+            networks.critic(slow_critic, stop_gradient(replayed), config),
+        )
+        elements["replay_critic"] = replay_critic_loss(
+            logits, slow_logits, targets, np.asarray(batch["is_last"])[:, :-1], config
+        )
 
     means = {name: float(np.mean(value)) if value.size else 0.0 for name, value in elements.items()}
     total = sum(_loss_scale(name, config) * mean for name, mean in means.items())
@@ -302,8 +324,11 @@ def train_step(
     return new_state, aux
 
 
-def directional_derivative(function: Callable[[dict[str, Array]], Any], params: Params, direction: Params, step: float) -> Any:
-    """The derivative of `function` at `params` along `direction`, stop-gradients held constant. Implements [AGT-32], [CON-14].
+def directional_derivative(
+    function: Callable[[dict[str, Array]], Any], params: Params, direction: Params, step: float
+) -> Any:
+    """The derivative of `function` at `params` along `direction`, stop-gradients held constant. Implements [AGT-32],
+    [CON-14].
 
     Args:
       function: params -> scalar or array; must call `stop_gradient` equally often at every point.
@@ -322,7 +347,9 @@ def directional_derivative(function: Callable[[dict[str, Array]], Any], params: 
 
     def shifted(distance: float) -> dict[str, Array]:
         moved = {name: np.array(value, np.float64) for name, value in params.items()}
-        return moved | {name: moved[name] + distance * np.asarray(value, np.float64) for name, value in direction.items()}
+        return moved | {
+            name: moved[name] + distance * np.asarray(value, np.float64) for name, value in direction.items()
+        }
 
     with recording() as tape:
         function(shifted(0.0))
@@ -352,7 +379,9 @@ def _check_batch(batch: Mapping[str, Any], spaces: Spaces, config: Config) -> No
     require_shape("batch['stoch']", np.shape(batch["stoch"]), rows, config.stoch)
     indices = np.asarray(batch["stoch"])
     if indices.dtype.kind not in "iu" or indices.min() < 0 or indices.max() >= config.classes:
-        raise ValueError(f"batch['stoch']: expected class indices in 0 .. {config.classes - 1}, got {indices.dtype} {indices!r}")
+        raise ValueError(
+            f"batch['stoch']: expected class indices in 0 .. {config.classes - 1}, got {indices.dtype} {indices!r}"
+        )
     for key, space in spaces.observations.items():
         require_shape(f"batch[{key!r}]", np.shape(batch[key]), rows, length, *space.array_shape)
 
@@ -367,4 +396,6 @@ def _check_noise(noise: Mapping[str, Any], rows: int, length: int, spaces: Space
 def _same_names(what: str, given: Any, expected: Any) -> None:
     missing, unknown = sorted(set(expected) - set(given)), sorted(set(given) - set(expected))
     if missing or unknown:
-        raise ValueError(f"{what}: missing {missing[:5]}, unknown {unknown[:5]} ({len(missing)} missing, {len(unknown)} unknown)")
+        raise ValueError(
+            f"{what}: missing {missing[:5]}, unknown {unknown[:5]} ({len(missing)} missing, {len(unknown)} unknown)"
+        )

@@ -29,7 +29,8 @@ Outputs = Mapping[str, Mapping[str, Any]]
 
 
 def sample_action(outputs: Outputs, noise: Any, spaces: Spaces, config: Config) -> Array:
-    """A flat action from the actor's raw outputs, a constant. Implements [BEH-1] to [BEH-5], [BEH-8], [BEH-22], [BEH-23].
+    """A flat action from the actor's raw outputs, a constant. Implements [BEH-1] to [BEH-5], [BEH-8], [BEH-22],
+    [BEH-23].
 
     Paper: section Critic learning, the actor; D-22, D-66, D-67, D-70.
 
@@ -67,7 +68,8 @@ def mode_action(outputs: Outputs, spaces: Spaces, config: Config) -> Array:
       outputs: as in `sample_action`.
 
     Returns:
-      [..., A]: one-hot at the most probable class, the first of equals, for every entry of a Discrete; the mean for a Vector.
+      [..., A]: one-hot at the most probable class, the first of equals, for every entry of a Discrete; the mean for a
+      Vector.
 
     Raises:
       ValueError: wrong keys or shapes.
@@ -142,7 +144,8 @@ def action_entropy(outputs: Outputs, spaces: Spaces, config: Config) -> Array:
 
 
 def actor_loss(log_prob: Any, entropy: Any, returns: Any, value: Any, weight: Any, scale: Any, config: Config) -> Array:
-    """The Reinforce loss with entropy regularizer. Implements [BEH-9] to [BEH-11], [BEH-17], [BEH-18], [BEH-22] to [BEH-24].
+    """The Reinforce loss with entropy regularizer. Implements [BEH-9] to [BEH-11], [BEH-17], [BEH-18], [BEH-22] to
+    [BEH-24].
 
     Paper: section Actor learning, the loss with its sign mended; D-09, D-60, D-61.
 
@@ -174,7 +177,8 @@ def critic_loss(logits: Any, slow_logits: Any, returns: Any, weight: Any, config
     Paper: section Critic learning; D-09, D-51, D-53.
 
     Args:
-      logits, slow_logits: [N, H, bins], critic and slow critic at the same states; the gradient passes through logits only.
+      logits, slow_logits: [N, H, bins], critic and slow critic at the same states; the gradient passes through logits
+        only.
       returns: [N, H], units of reward.
       weight: [N, H].
 
@@ -185,7 +189,9 @@ def critic_loss(logits: Any, slow_logits: Any, returns: Any, weight: Any, config
       ValueError: a wrong shape.
     """
     weight = checked("weight", weight, "N", "H")
-    return np.asarray(stop_gradient(weight) * _regularized_value_loss(logits, slow_logits, returns, weight.shape, config))
+    return np.asarray(
+        stop_gradient(weight) * _regularized_value_loss(logits, slow_logits, returns, weight.shape, config)
+    )
 
 
 def replay_critic_loss(logits: Any, slow_logits: Any, returns: Any, is_last: Any, config: Config) -> Array:
@@ -194,7 +200,8 @@ def replay_critic_loss(logits: Any, slow_logits: Any, returns: Any, is_last: Any
     Paper: section Critic learning, the paragraph on the critic replay loss; D-32, D-54, D-55.
 
     Args:
-      logits, slow_logits: [B, T-1, bins], critic and slow critic at the posterior states 0 .. T-2; the gradient passes through logits.
+      logits, slow_logits: [B, T-1, bins], critic and slow critic at the posterior states 0 .. T-2; the gradient passes
+        through logits.
       returns: [B, T-1], units of reward, of `replay_lambda_return`.
       is_last: [B, T-1], flags of the same steps, booleans or 0 and 1.
 
@@ -227,7 +234,9 @@ def update_slow_critic(slow: Mapping[str, Any], critic: Mapping[str, Any], decay
     expected = {name for name in critic if name.startswith("critic/")}
     if set(slow) != expected:
         missing, unknown = sorted(expected - set(slow)), sorted(set(slow) - expected)
-        raise ValueError(f"slow must have exactly the critic/ names of critic; missing: {missing}, not in critic: {unknown}")
+        raise ValueError(
+            f"slow must have exactly the critic/ names of critic; missing: {missing}, not in critic: {unknown}"
+        )
     updated: dict[str, Array] = {}
     for name in slow:
         new = np.asarray(critic[name], dtype=np.float64)
@@ -236,8 +245,11 @@ def update_slow_critic(slow: Mapping[str, Any], critic: Mapping[str, Any], decay
     return updated
 
 
-def _regularized_value_loss(logits: Any, slow_logits: Any, returns: Any, shape: tuple[int, ...], config: Config) -> Array:
-    """[rows, steps]: cross entropy towards the return plus cross entropy towards the slow critic's mean, both targets constant."""
+def _regularized_value_loss(
+    logits: Any, slow_logits: Any, returns: Any, shape: tuple[int, ...], config: Config
+) -> Array:
+    """[rows, steps]: cross entropy towards the return plus cross entropy towards the slow critic's mean, both targets
+    constant."""
     logits = checked("logits", logits, *shape, config.bins)
     slow_logits = checked("slow_logits", slow_logits, *shape, config.bins)
     returns = checked("returns", returns, *shape)
@@ -278,7 +290,8 @@ def _normal(outputs: Mapping[str, Array], config: Config) -> tuple[Array, Array]
 
 
 def _categoricals(logits: Array, space: Discrete, config: Config) -> Iterator[tuple[Array, slice]]:
-    """For each entry of `classes` its mixed log-probabilities and its place in the logits and in the flat action of the key."""
+    """For each entry of `classes` its mixed log-probabilities and its place in the logits and in the flat action of the
+    key."""
     start = 0
     for classes in space.classes:
         segment = slice(start, start + classes)

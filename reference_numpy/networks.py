@@ -61,7 +61,8 @@ def encoder(params: Params, observations: Mapping[str, Any], spaces: Spaces, con
       [..., E]: vector features, then image features in the order height, width, channels.
 
     Raises:
-      ValueError: a key is missing, a shape or dtype does not fit, a Discrete value is out of range, or an image cannot be halved.
+      ValueError: a key is missing, a shape or dtype does not fit, a Discrete value is out of range, or an image cannot
+        be halved.
     """
     rows = _leading_axes(observations, spaces)
     if spaces.images:
@@ -69,7 +70,9 @@ def encoder(params: Params, observations: Mapping[str, Any], spaces: Spaces, con
     tokens = []
     if spaces.vectors:
         inputs = [_encode_vector(key, observations[key], space) for key, space in spaces.vectors.items()]
-        tokens.append(mlp(params, "encoder/vector", np.concatenate(inputs, axis=-1), config.encoder_layers, config.norm_epsilon))
+        tokens.append(
+            mlp(params, "encoder/vector", np.concatenate(inputs, axis=-1), config.encoder_layers, config.norm_epsilon)
+        )
     if spaces.images:
         images = [scaled_image(key, observations[key]) - 0.5 for key in spaces.images]
         picture = np.concatenate(images, axis=-1)
@@ -87,7 +90,8 @@ def decoder(params: Params, feature: Any, spaces: Spaces, config: Config) -> dic
       feature: [..., F], the model state.
 
     Returns:
-      By key: Vector [..., size] in symlog space; Discrete logits [..., sum of classes]; Image [..., height, width, channels] in [0, 1].
+      By key: Vector [..., size] in symlog space; Discrete logits [..., sum of classes]; Image [..., height, width,
+        channels] in [0, 1].
 
     Raises:
       ValueError: a shape does not fit, or an image cannot be halved as often as configured.
@@ -165,7 +169,8 @@ def actor(params: Params, feature: Any, spaces: Spaces, config: Config) -> dict[
       feature: [..., F].
 
     Returns:
-      By action key: {"logits": [..., sum of classes]} for a Discrete, {"mean": [..., size], "std": [..., size]} for a Vector.
+      By action key: {"logits": [..., sum of classes]} for a Discrete, {"mean": [..., size], "std": [..., size]} for a
+        Vector.
 
     Raises:
       ValueError: a shape does not fit.

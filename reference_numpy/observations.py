@@ -1,4 +1,5 @@
-"""Raw observations as numbers, for the encoder and for the reconstruction losses. Chapters: spec/05-networks.md, 06-world-model.md."""
+"""Raw observations as numbers, for the encoder and for the reconstruction losses. Chapters: spec/05-networks.md,
+06-world-model.md."""
 
 from typing import Any
 
@@ -33,7 +34,9 @@ def one_hots(key: str, value: Any, space: Discrete) -> Array:
         column = value[..., entry]
         wrong = column[(column < 0) | (column >= classes)]
         if wrong.size:
-            raise ValueError(f"observation {key!r}, entry {entry}: expected values in 0 .. {classes - 1}, got {wrong.flat[0]}")
+            raise ValueError(
+                f"observation {key!r}, entry {entry}: expected values in 0 .. {classes - 1}, got {wrong.flat[0]}"
+            )
         outputs.append((column[..., None] == np.arange(classes)).astype(np.float64))
     return np.concatenate(outputs, axis=-1)
 

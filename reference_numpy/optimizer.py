@@ -16,7 +16,8 @@ DEAD_ZONE = 1e-16  # [OPT-9]: below this the square of a gradient would leave th
 
 
 def adaptive_gradient_clip(gradient: Any, parameter: Any, clip: float, epsilon: float) -> Array:
-    """The gradient of one tensor, shortened where it is too long for the tensor. Implements [OPT-1] to [OPT-5], [OPT-19].
+    """The gradient of one tensor, shortened where it is too long for the tensor. Implements [OPT-1] to [OPT-5],
+    [OPT-19].
 
     Paper: Methods, Implementation, paragraph Optimizer; D-74.
 
@@ -75,7 +76,8 @@ def laprop(gradient: Any, second_moment: Any, momentum: Any, step: int, config: 
       step: number of updates made before, 0 or more.
 
     Returns:
-      The update (to be multiplied by the learning rate and subtracted), the new second moment and the new momentum, each [...].
+      The update (to be multiplied by the learning rate and subtracted), the new second moment and the new momentum,
+      each [...].
 
     Raises:
       ValueError: the shapes differ, or the step is negative.
@@ -113,10 +115,16 @@ def optimizer_step(
     Raises:
       ValueError: names or shapes do not match.
     """
-    for label, mapping in (("gradients", gradients), ("second_moment", state["second_moment"]), ("momentum", state["momentum"])):
+    for label, mapping in (
+        ("gradients", gradients),
+        ("second_moment", state["second_moment"]),
+        ("momentum", state["momentum"]),
+    ):
         if set(mapping) != set(params):
             missing, unknown = sorted(set(params) - set(mapping)), sorted(set(mapping) - set(params))
-            raise ValueError(f"{label} must have exactly the names of params; missing: {missing}, not in params: {unknown}")
+            raise ValueError(
+                f"{label} must have exactly the names of params; missing: {missing}, not in params: {unknown}"
+            )
     step = int(state["step"])
     rate = learning_rate(step, config)
     new_params: dict[str, Array] = {}

@@ -1,7 +1,7 @@
 """The replay buffer: uniform sampling with an online queue, stored latents and their write-back.
 
-Chapter: spec/11-replay.md. Paper: section Implementation, Experience replay. This is the plain definition; it is also fast enough for
-small runs. Nothing here is differentiable, and types are those of the records, not float64.
+Chapter: spec/11-replay.md. Paper: section Implementation, Experience replay. This is the plain definition; it is also
+fast enough for small runs. Nothing here is differentiable, and types are those of the records, not float64.
 """
 
 import collections
@@ -58,7 +58,8 @@ class Replay:
         self._streams: dict[int, _Stream] = {}
         self._next_stream = 0
         self._current: dict[int, int] = {}  # worker -> number of the stream it writes to
-        # A ring: item number i, counted from the oldest, is at (oldest + i) % len. It grows until it holds `capacity` items.
+        # A ring: item number i, counted from the oldest, is at (oldest + i) % len. It grows until it holds `capacity`
+        # items.
         self._items: list[tuple[int, int]] = []
         self._oldest = 0
         self._queue: collections.deque[tuple[int, int]] = collections.deque()
@@ -70,7 +71,8 @@ class Replay:
         return len(self._items)
 
     def add(self, step: Mapping[str, Any], worker: int) -> None:
-        """Appends one record to the stream of a worker. Implements [REP-1], [REP-2], [REP-4] to [REP-7], [REP-27], [REP-28].
+        """Appends one record to the stream of a worker. Implements [REP-1], [REP-2], [REP-4] to [REP-7], [REP-27],
+        [REP-28].
 
         Args:
           step: observations, reward, is_first, is_last, is_terminal, action [A], deter [D], stoch [S]; copied.
@@ -102,8 +104,8 @@ class Replay:
           online: whether rows may come from the online queue.
 
         Returns:
-          Observations [B, T, ...], reward, is_first, is_last, is_terminal [B, T], prev_action [B, T, A], the context's deter [B, D] and
-          stoch [B, S], and ids [B, 2].
+          Observations [B, T, ...], reward, is_first, is_last, is_terminal [B, T], prev_action [B, T, A], the context's
+          deter [B, D] and stoch [B, S], and ids [B, 2].
 
         Raises:
           ValueError: no items, or uniforms outside [0, 1).
@@ -169,16 +171,23 @@ class Replay:
         return state
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Replaces the content by a saved one; all streams are closed, the queue is empty. Implements [REP-24] to [REP-26].
+        """Replaces the content by a saved one; all streams are closed, the queue is empty. Implements [REP-24] to
+        [REP-26].
 
         Raises:
           ValueError: the state was saved with another length.
         """
         if int(state["length"]) != self.length:
-            raise ValueError(f"the saved replay has length {int(state['length'])}, this one {self.length}: sequences would differ")
+            raise ValueError(
+                f"the saved replay has length {int(state['length'])}, this one {self.length}: sequences would differ"
+            )
         self._clear()
         self._next_stream = int(state["next_stream"])
-        arrays = {name.removeprefix("records/"): np.asarray(array) for name, array in state.items() if name.startswith("records/")}
+        arrays = {
+            name.removeprefix("records/"): np.asarray(array)
+            for name, array in state.items()
+            if name.startswith("records/")
+        }
         self._shapes = {key: array.shape[1:] for key, array in arrays.items()}
         self._dtypes = {key: array.dtype for key, array in arrays.items()}
         row = 0
@@ -202,11 +211,15 @@ class Replay:
             dtypes = {key: np.dtype(_TYPES.get(key, floats.get(key, value.dtype))) for key, value in values.items()}
             self._shapes, self._dtypes = {key: value.shape for key, value in values.items()}, dtypes
         if values.keys() != self._shapes.keys():
-            raise ValueError(f"the record has the keys {sorted(values)}; expected {sorted(self._shapes)} as in the first record")
+            raise ValueError(
+                f"the record has the keys {sorted(values)}; expected {sorted(self._shapes)} as in the first record"
+            )
         for key, value in values.items():
             require_shape(f"{key} of the record", value.shape, *self._shapes[key])
             if not np.can_cast(value.dtype, self._dtypes[key], "same_kind"):
-                raise ValueError(f"{key} of the record: expected numbers of type {self._dtypes[key]}, got {value.dtype}")
+                raise ValueError(
+                    f"{key} of the record: expected numbers of type {self._dtypes[key]}, got {value.dtype}"
+                )
         return {key: np.array(value, self._dtypes[key]) for key, value in values.items()}
 
     def _add_item(self, item: tuple[int, int]) -> None:
@@ -218,7 +231,8 @@ class Replay:
         self._oldest = (self._oldest + 1) % self.capacity
 
     def _evict(self, number: int, start: int) -> None:
-        """A stream's items leave in the order of their starts, so exactly the record at the start is no longer needed."""
+        """A stream's items leave in the order of their starts, so exactly the record at the start is no longer
+        needed."""
         stream = self._streams[number]
         del stream.records[start]
         stream.first = start + 1

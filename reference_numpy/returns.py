@@ -1,4 +1,5 @@
-"""λ-returns, cumulative weights and the return range: plain arithmetic, every result is a constant. Chapter: spec/07-returns.md."""
+"""λ-returns, cumulative weights and the return range: plain arithmetic, every result is a constant. Chapter:
+spec/07-returns.md."""
 
 import math
 from typing import Any
@@ -43,7 +44,9 @@ def lambda_return(reward: Any, continue_: Any, value: Any, discount: float, lamb
     return returns
 
 
-def replay_lambda_return(reward: Any, is_last: Any, is_terminal: Any, annotation: Any, discount: float, lambda_: float) -> Array:
+def replay_lambda_return(
+    reward: Any, is_last: Any, is_terminal: Any, annotation: Any, discount: float, lambda_: float
+) -> Array:
     """The λ-return of every replayed step but the last. Implements [RET-5], [RET-9] to [RET-11], [RET-17] to [RET-20].
 
     Paper: section Critic learning, the paragraph on the critic replay loss; D-54, D-55.
@@ -69,7 +72,8 @@ def replay_lambda_return(reward: Any, is_last: Any, is_terminal: Any, annotation
     returns = np.zeros((len(reward), last))
     later = annotation[:, last]
     for t in reversed(range(last)):
-        # Where the arrival step ends an episode only its annotation counts: what follows in the sequence is another episode.
+        # Where the arrival step ends an episode only its annotation counts: what follows in the sequence is another
+        # episode.
         mix = lambda_ * (1 - is_last[:, t + 1])
         future = (1 - mix) * annotation[:, t + 1] + mix * later
         later = reward[:, t + 1] + discount * (1 - is_terminal[:, t + 1]) * future
@@ -135,7 +139,8 @@ def percentile(values: Any, q: float) -> float:
 
 
 def update_return_range(low: Any, high: Any, returns: Any, config: Config) -> tuple[float, float]:
-    """The averaged percentiles after the imagined returns of this step. Implements [RET-14], [RET-15], [RET-17] to [RET-19].
+    """The averaged percentiles after the imagined returns of this step. Implements [RET-14], [RET-15], [RET-17] to
+    [RET-19].
 
     Paper: section Actor learning, equation of S; D-59, D-63, D-64.
 
@@ -178,5 +183,7 @@ def return_scale(low: Any, high: Any, limit: float) -> float:
 def _steps(name: str, value: Any, at_least: int) -> Array:
     array = checked(name, value, "rows", "steps")
     if array.shape[1] < at_least:
-        raise ValueError(f"{name}: expected shape [rows, steps] with at least {at_least} steps, got {list(array.shape)}")
+        raise ValueError(
+            f"{name}: expected shape [rows, steps] with at least {at_least} steps, got {list(array.shape)}"
+        )
     return array

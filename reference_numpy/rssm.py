@@ -1,4 +1,5 @@
-"""The recurrent state-space model: memory update, prior, posterior, observing a sequence, imagining. Chapter: spec/04-rssm.md."""
+"""The recurrent state-space model: memory update, prior, posterior, observing a sequence, imagining. Chapter:
+spec/04-rssm.md."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -149,8 +150,11 @@ def observe_step(
     return {"deter": deter, "stoch": stoch}, logits
 
 
-def observe(params: Params, carry: Carry, tokens: Any, prev_action: Any, is_first: Any, uniform: Any, config: Config) -> dict[str, Array]:
-    """A sequence of observations, with resets wherever an episode starts. Implements [RSSM-17] to [RSSM-19], [RSSM-23], [RSSM-27].
+def observe(
+    params: Params, carry: Carry, tokens: Any, prev_action: Any, is_first: Any, uniform: Any, config: Config
+) -> dict[str, Array]:
+    """A sequence of observations, with resets wherever an episode starts. Implements [RSSM-17] to [RSSM-19], [RSSM-23],
+    [RSSM-27].
 
     Paper: World model learning; D-20, D-85, D-86.
 
@@ -163,7 +167,8 @@ def observe(params: Params, carry: Carry, tokens: Any, prev_action: Any, is_firs
       uniform: [B, T, S], numbers in [0, 1).
 
     Returns:
-      "deter" [B, T, D], "stoch" [B, T, S, C] (posterior samples) and "logits" [B, T, S, C] (posterior, before the uniform mixture).
+      "deter" [B, T, D], "stoch" [B, T, S, C] (posterior samples) and "logits" [B, T, S, C] (posterior, before the
+      uniform mixture).
 
     Raises:
       ValueError: a shape does not fit.
@@ -180,14 +185,18 @@ def observe(params: Params, carry: Carry, tokens: Any, prev_action: Any, is_firs
     state = {name: stop_gradient(np.asarray(carry[name], dtype=np.float64)) for name in ("deter", "stoch")}
     outputs: dict[str, list[Array]] = {"deter": [], "stoch": [], "logits": []}
     for t in range(steps):
-        state, logits = observe_step(params, state, tokens[:, t], prev_action[:, t], is_first[:, t], uniform[:, t], config)
+        state, logits = observe_step(
+            params, state, tokens[:, t], prev_action[:, t], is_first[:, t], uniform[:, t], config
+        )
         outputs["deter"].append(state["deter"])
         outputs["stoch"].append(state["stoch"])
         outputs["logits"].append(logits)
     return {name: np.stack(values, axis=1) for name, values in outputs.items()}
 
 
-def imagine(params: Params, carry: Carry, policy: Callable[[Array, int], Any], uniform: Any, config: Config) -> dict[str, Array]:
+def imagine(
+    params: Params, carry: Carry, policy: Callable[[Array, int], Any], uniform: Any, config: Config
+) -> dict[str, Array]:
     """Trajectories without observations, under a policy. Implements [RSSM-20] to [RSSM-22], [RSSM-25], [RSSM-27].
 
     Paper: Critic learning ("abstract trajectories"); D-01, D-58.
@@ -210,7 +219,9 @@ def imagine(params: Params, carry: Carry, policy: Callable[[Array, int], Any], u
     stoch = stop_gradient(checked("carry stoch", carry["stoch"], rows, config.stoch, config.classes))
     deters, stochs, actions = [deter], [stoch], []
     for t in range(horizon):
-        action = stop_gradient(checked("action of the policy", policy(feature(deter, stoch), t), rows, _action_size(params)))
+        action = stop_gradient(
+            checked("action of the policy", policy(feature(deter, stoch), t), rows, _action_size(params))
+        )
         deter = stop_gradient(core(params, deter, stoch, action, config))
         log_probs = unimix_log_probs(prior(params, deter, config), config.latent_unimix)
         stoch = categorical_sample(log_probs, uniform[:, t])

@@ -13,7 +13,8 @@ def checked(name: str, value: Any, *expected: int | str | EllipsisType) -> NDArr
     Args:
       name: what the message calls the argument.
       value: anything that converts to an array of real numbers.
-      expected: one entry for each axis: a length, or a letter for any length; a leading `...` stands for any number of axes.
+      expected: one entry for each axis: a length, or a letter for any length; a leading `...` stands for any number of
+        axes.
 
     Raises:
       ValueError: the shape differs; the message holds the name, the expected shape and the shape that came.

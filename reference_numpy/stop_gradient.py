@@ -1,7 +1,8 @@
 """Stop-gradient without gradients: constants are recorded on one pass and replayed on later ones.
 
-A central difference evaluates a loss at two shifted sets of parameters. What the gradient treats as a constant must not move with them.
-So the loss runs once at the unshifted parameters while `recording`, and at each shifted set while `replaying`:
+A central difference evaluates a loss at two shifted sets of parameters. What the gradient treats as a constant must not
+move with them. So the loss runs once at the unshifted parameters while `recording`, and at each shifted set while
+`replaying`:
 
     with recording() as tape:
         loss(params)
@@ -34,7 +35,9 @@ class _Replay:
     def next(self, shape: tuple[int, ...]) -> Array:
         call = self.position
         if call >= len(self.tape):
-            raise ValueError(f"stop_gradient was called more often than recorded: {len(self.tape)} calls are on the tape")
+            raise ValueError(
+                f"stop_gradient was called more often than recorded: {len(self.tape)} calls are on the tape"
+            )
         if self.tape[call].shape != shape:
             raise ValueError(f"stop_gradient call {call}: recorded shape {self.tape[call].shape}, got {shape}")
         self.position += 1
@@ -68,7 +71,8 @@ def stop_gradient(x: Any) -> Array:
 
 @contextmanager
 def recording() -> Iterator[Tape]:
-    """A context in which stop_gradient also writes a copy of each value to the tape, in order. Implements [CON-14], [DIS-2].
+    """A context in which stop_gradient also writes a copy of each value to the tape, in order. Implements [CON-14],
+    [DIS-2].
 
     Raises:
       ValueError: inside another recording or replay.

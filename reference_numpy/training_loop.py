@@ -1,6 +1,7 @@
 """What a training loop must decide exactly: when to train, what to store, what the environment gets, and every seed.
 
-Chapter: spec/12-training-loop.md. Paper: section Implementation, Experience replay; section Critic learning (action sampling).
+Chapter: spec/12-training-loop.md. Paper: section Implementation, Experience replay; section Critic learning (action
+sampling).
 """
 
 import hashlib
@@ -77,7 +78,10 @@ def can_train(items: int, config: Config) -> bool:
     """
     needed = config.batch_size * config.batch_length
     if config.replay_capacity < needed:
-        raise ValueError(f"replay_capacity is {config.replay_capacity}; training starts at batch_size * batch_length = {needed} items")
+        raise ValueError(
+            f"replay_capacity is {config.replay_capacity}; training starts at "
+            f"batch_size * batch_length = {needed} items"
+        )
     return items >= needed
 
 
@@ -119,7 +123,9 @@ def make_record(
     }
 
 
-def environment_action(action: Any, spaces: Spaces, low: Mapping[str, Any], high: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
+def environment_action(
+    action: Any, spaces: Spaces, low: Mapping[str, Any], high: Mapping[str, Any]
+) -> dict[str, NDArray[Any]]:
     """What the environment receives for a flat action. Implements [LOOP-12], [CON-27].
 
     Args:
@@ -144,12 +150,15 @@ def environment_action(action: Any, spaces: Spaces, low: Mapping[str, Any], high
             choices = np.split(part, np.cumsum(space.classes)[:-1], axis=-1)
             result[key] = np.stack([np.argmax(choice, axis=-1) for choice in choices], axis=-1)
         else:
-            result[key] = _rescale(part, checked(f"low[{key!r}]", low[key], space.size), checked(f"high[{key!r}]", high[key], space.size))
+            result[key] = _rescale(
+                part, checked(f"low[{key!r}]", low[key], space.size), checked(f"high[{key!r}]", high[key], space.size)
+            )
     return result
 
 
 def _rescale(part: NDArray[Any], low: NDArray[Any], high: NDArray[Any]) -> NDArray[Any]:
-    """[-1, 1] to the range of each dimension: between its bounds, 2 wide at the only one, or as it is where there is none."""
+    """[-1, 1] to the range of each dimension: between its bounds, 2 wide at the only one, or as it is where there is
+    none."""
     clipped = np.clip(part, -1.0, 1.0)
     below, above = np.isfinite(low), np.isfinite(high)
     with np.errstate(invalid="ignore"):  # Not taken where it is infinite.

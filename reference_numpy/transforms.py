@@ -73,8 +73,8 @@ def twohot(x: Any, bins: Any) -> Array:
       bins: [K], strictly increasing.
 
     Returns:
-      [..., K], zero except for the last bin that is <= x and its upper neighbour. Beyond the ends the end bin gets everything. NaN where
-      x is NaN.
+      [..., K], zero except for the last bin that is <= x and its upper neighbour. Beyond the ends the end bin gets
+      everything. NaN where x is NaN.
 
     Raises:
       ValueError: bins is not one-dimensional, or shorter than 2.
@@ -114,7 +114,8 @@ def ordered_expectation(probs: Any, bins: Any) -> Array:
       [...]: sum of probs * bins over the last axis, taken over mirrored pairs from small to large.
 
     Raises:
-      ValueError: bins is not one-dimensional, has an even number, fewer than 3, or is not symmetric; probs has another last axis.
+      ValueError: bins is not one-dimensional, has an even number, fewer than 3, or is not symmetric; probs has another
+        last axis.
     """
     bins = checked("bins", bins, "K")
     if len(bins) < 3 or len(bins) % 2 == 0:

@@ -76,8 +76,8 @@ def reconstruction_losses(
     Paper: Robust predictions (vectors); D-14 to D-17.
 
     Args:
-      predictions: output of the decoder: Vector [..., size] in symlog space, Discrete [..., sum of classes], Image [..., height, width,
-        channels].
+      predictions: output of the decoder: Vector [..., size] in symlog space, Discrete [..., sum of classes], Image
+        [..., height, width, channels].
       observations: raw observations by key, each [..., *array_shape]; other keys are ignored.
 
     Returns:
@@ -123,7 +123,8 @@ def world_model_losses(
       states: "deter" [B, T, D], "stoch" [B, T, S, C] and "logits" [B, T, S, C], as `rssm.observe` returns them.
 
     Returns:
-      "reconstruction/{key}" for every observation key, "reward", "continue", "dynamics" and "representation", each [B, T].
+      "reconstruction/{key}" for every observation key, "reward", "continue", "dynamics" and "representation", each [B,
+      T].
 
     Raises:
       ValueError: a key is missing, or a shape, dtype or Discrete value does not fit.
@@ -178,11 +179,13 @@ def open_loop(
       noise: {"posterior" [B, context, S], "prior" [B, T - context, S]}, numbers in [0, 1).
 
     Returns:
-      At every step, by observation key: Vector [B, T, size] in its own units, Discrete [B, T, sum of classes] probabilities, Image
-      [B, T, height, width, channels] in [0, 1]; and "reward" [B, T], "continue_" [B, T] probabilities.
+      At every step, by observation key: Vector [B, T, size] in its own units, Discrete [B, T, sum of classes]
+      probabilities, Image [B, T, height, width, channels] in [0, 1]; and "reward" [B, T], "continue_" [B, T]
+      probabilities.
 
     Raises:
-      ValueError: a key is missing, a shape, dtype or Discrete value does not fit, or the context is not within the sequence.
+      ValueError: a key is missing, a shape, dtype or Discrete value does not fit, or the context is not within the
+        sequence.
     """
     is_first = np.asarray(is_first, dtype=bool)
     require_shape("is_first", is_first.shape, "B", "T")
@@ -199,12 +202,16 @@ def open_loop(
     seen = {key: np.asarray(observation[key])[:, :context] for key in spaces.observations}
     tokens = networks.encoder(params, seen, spaces, config)
     zeros = {"deter": np.zeros((rows, config.deter)), "stoch": np.zeros((rows, config.stoch, config.classes))}
-    states = rssm.observe(params, zeros, tokens, prev_action[:, :context], is_first[:, :context], noise["posterior"], config)
+    states = rssm.observe(
+        params, zeros, tokens, prev_action[:, :context], is_first[:, :context], noise["posterior"], config
+    )
     deters, stochs = list(np.moveaxis(states["deter"], 1, 0)), list(np.moveaxis(states["stoch"], 1, 0))
     for t in range(context, steps):
         starts = is_first[:, t, None]
         stoch = np.where(starts[..., None], 0.0, stochs[-1])
-        deter = rssm.core(params, np.where(starts, 0.0, deters[-1]), stoch, np.where(starts, 0.0, prev_action[:, t]), config)
+        deter = rssm.core(
+            params, np.where(starts, 0.0, deters[-1]), stoch, np.where(starts, 0.0, prev_action[:, t]), config
+        )
         log_probs = unimix_log_probs(rssm.prior(params, deter, config), config.latent_unimix)
         deters.append(deter)
         stochs.append(categorical_sample(log_probs, prior_noise[:, t - context]))
@@ -229,7 +236,8 @@ def _in_units(prediction: Array, space: Vector | Discrete | Image) -> Array:
 
 
 def _cross_entropy(logits: Array, target: Array, space: Discrete) -> Array:
-    """Cross entropy of one categorical for each entry of a Discrete, summed over the entries: [..., sum of classes] -> [...]."""
+    """Cross entropy of one categorical for each entry of a Discrete, summed over the entries: [..., sum of classes] ->
+    [...]."""
     total, first = np.zeros(logits.shape[:-1]), 0
     for classes in space.classes:
         entry = slice(first, first + classes)

@@ -1,18 +1,20 @@
-"""The editions of the algorithm: which there are, and where each leaves the requirements. The data are in editions.toml."""
+"""The editions of the algorithm: which there are, and where each leaves the requirements. The data are in
+editions.toml."""
 
 import dataclasses
 import functools
 import tomllib
 from collections.abc import Mapping
 from importlib import resources
+from typing import Any
 
 
 @dataclasses.dataclass(frozen=True)
 class Difference:
     """What holds in an edition in place of a requirement.
 
-    instead: a sentence. like: the mutant of the reference that behaves so. settings: hyperparameters that the edition's profile sets, by
-    which the requirement itself allows it. With neither, the edition's way is not modelled here.
+    instead: a sentence. like: the mutant of the reference that behaves so. settings: hyperparameters that the edition's
+    profile sets, by which the requirement itself allows it. With neither, the edition's way is not modelled here.
     """
 
     instead: str
@@ -28,7 +30,8 @@ class Difference:
 class Edition:
     """One edition.
 
-    title, source, date: which program or text it is. profile: the name of its values. differs: requirement id -> what holds instead.
+    title, source, date: which program or text it is. profile: the name of its values. differs: requirement id -> what
+    holds instead.
     beyond: "row.function" of the reference, what the edition has otherwise without a model here.
     """
 
@@ -58,11 +61,13 @@ def editions() -> dict[str, Edition]:
     return {name: _edition(name, **entry) for name, entry in data.items()}
 
 
-def _edition(name: str, differs: dict[str, dict[str, object]], beyond: list[str], **about: str) -> Edition:
-    differences = {
-        requirement: Difference(**{key: tuple(value) if isinstance(value, list) else value for key, value in entry.items()})  # type: ignore[arg-type]
-        for requirement, entry in differs.items()
-    }
+def _edition(name: str, differs: dict[str, dict[str, Any]], beyond: list[str], **about: str) -> Edition:
+    differences = {}
+    for requirement, entry in differs.items():
+        fields: dict[str, Any] = {
+            key: tuple(value) if isinstance(value, list) else value for key, value in entry.items()
+        }
+        differences[requirement] = Difference(**fields)
     return Edition(name, differs=differences, beyond=tuple(beyond), **about)
 
 

@@ -1,8 +1,10 @@
-"""The parameter table: canonical name -> shape and initializer, derived from a configuration and spaces in this one place.
+"""The parameter table: canonical name -> shape and initializer, derived from a configuration and spaces in this one
+place.
 
-Names are paths: `rssm/gru/kernel`. A linear layer has `kernel` [in, out] and `bias` [out]; a block-linear layer has `kernel`
-[blocks, in/blocks, out/blocks] and `bias` [out]; a convolution has `kernel` [5, 5, in, out] and `bias` [out]; a layer that is followed by
-RMSNorm and SiLU also has `scale` [out]. The slow critic is a copy of `critic/...` and not in the table. Chapter: spec/10-agent.md.
+Names are paths: `rssm/gru/kernel`. A linear layer has `kernel` [in, out] and `bias` [out]; a block-linear layer has
+`kernel` [blocks, in/blocks, out/blocks] and `bias` [out]; a convolution has `kernel` [5, 5, in, out] and `bias` [out];
+a layer that is followed by RMSNorm and SiLU also has `scale` [out]. The slow critic is a copy of `critic/...` and not
+in the table. Chapter: spec/10-agent.md.
 """
 
 import dataclasses
@@ -18,8 +20,8 @@ CNN_KERNEL = 5  # D-35
 class Parameter:
     """One tensor of the table.
 
-    initializer: "truncated_normal", "zeros" or "ones"; fan_in and outscale apply to the first: its standard deviation is
-    outscale / sqrt(fan_in), see [LAY-9].
+    initializer: "truncated_normal", "zeros" or "ones"; fan_in and outscale apply to the first: its standard deviation
+    is outscale / sqrt(fan_in), see [LAY-9].
     """
 
     shape: tuple[int, ...]
@@ -117,7 +119,9 @@ def _decoder(config: Config, spaces: Spaces) -> Entries:
             yield from _linear(f"decoder/vector/out/{key}", config.units, space.encoded_size, norm=False)
     if spaces.images:
         height, width, channels = bottleneck(config, spaces)
-        yield from _block_linear("decoder/image/deter", config.blocks, config.deter, height * width * channels, norm=False)
+        yield from _block_linear(
+            "decoder/image/deter", config.blocks, config.deter, height * width * channels, norm=False
+        )
         yield from _linear("decoder/image/stoch_hidden", config.stoch * config.classes, 2 * config.units)
         yield from _linear("decoder/image/stoch", 2 * config.units, height * width * channels, norm=False)
         yield "decoder/image/stem/scale", Parameter((channels,), "ones")
@@ -132,7 +136,13 @@ def _actor(config: Config, spaces: Spaces) -> Entries:
     yield from _mlp("actor", config.actor_layers, config.feature_size, config.units)
     for key, space in spaces.actions.items():
         for output in ("logits",) if isinstance(space, Discrete) else ("mean", "std"):
-            yield from _linear(f"actor/out/{key}/{output}", config.units, space.encoded_size, norm=False, outscale=config.actor_outscale)
+            yield from _linear(
+                f"actor/out/{key}/{output}",
+                config.units,
+                space.encoded_size,
+                norm=False,
+                outscale=config.actor_outscale,
+            )
 
 
 def bottleneck(config: Config, spaces: Spaces) -> tuple[int, int, int]:

@@ -1,13 +1,14 @@
 """What an agent sees and does, in the form that the algorithm works with.
 
-Observations and actions are dictionaries by key, always walked in sorted order. Arrays of one time step, with any leading axes:
+Observations and actions are dictionaries by key, always walked in sorted order. Arrays of one time step, with any
+leading axes:
 
   Vector    float [..., size]
   Discrete  int   [..., len(classes)], entry i in 0 .. classes[i]-1
   Image     uint8 [..., height, width, channels]
 
-A flat action [..., action_size] is the concatenation over the keys of a Vector as it is and of a Discrete as one one-hot per entry.
-Chapter: spec/00-notation.md.
+A flat action [..., action_size] is the concatenation over the keys of a Vector as it is and of a Discrete as one
+one-hot per entry. Chapter: spec/00-notation.md.
 """
 
 import dataclasses
@@ -72,7 +73,9 @@ class Image:
 
 
 _KEY = re.compile(r"[A-Za-z0-9_-]+")
-_RESERVED = frozenset({"reward", "continue_", "is_first", "is_last", "is_terminal", "prev_action", "action", "deter", "stoch", "ids"})
+_RESERVED = frozenset(
+    {"reward", "continue_", "is_first", "is_last", "is_terminal", "prev_action", "action", "deter", "stoch", "ids"}
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,8 +83,8 @@ class Spaces:
     """The observations and actions of a task.
 
     Raises:
-      ValueError: no observation or no action, a key that cannot name a parameter or that a record, a batch or a prediction uses itself,
-        or images of different sizes.
+      ValueError: no observation or no action, a key that cannot name a parameter or that a record, a batch or a
+        prediction uses itself, or images of different sizes.
     """
 
     observations: Mapping[str, Vector | Discrete | Image]
@@ -120,7 +123,8 @@ class Spaces:
 
     @property
     def action_noise_size(self) -> int:
-        """Random numbers that one action takes: a standard normal for each real number, a uniform for each categorical."""
+        """Random numbers that one action takes: a standard normal for each real number, a uniform for each
+        categorical."""
         return sum(space.array_shape[0] for space in self.actions.values())
 
     def to_json(self) -> dict[str, Any]:
@@ -147,7 +151,9 @@ class Spaces:
                     {key: _from_json(f"observation {key!r}", entry, _OBSERVED) for key, entry in observations.items()},
                     {key: _from_json(f"action {key!r}", entry, _CHOSEN) for key, entry in actions.items()},
                 )
-        raise ValueError(f"spaces: expected an object with the objects observations and actions, got {description!r:.80}")
+        raise ValueError(
+            f"spaces: expected an object with the objects observations and actions, got {description!r:.80}"
+        )
 
 
 _OBSERVED, _CHOSEN = (Vector, Discrete, Image), (Vector, Discrete)
@@ -160,10 +166,14 @@ def _from_json(name: str, entry: Any, kinds: tuple[type, ...]) -> Any:
             space = Vector(size)
         case {"kind": "discrete", "classes": [*classes]} if _whole(*classes):
             space = Discrete(tuple(classes))
-        case {"kind": "image", "height": height, "width": width, "channels": channels} if _whole(height, width, channels):
+        case {"kind": "image", "height": height, "width": width, "channels": channels} if _whole(
+            height, width, channels
+        ):
             space = Image(height, width, channels)
     if not isinstance(space, kinds):
-        raise ValueError(f"{name}: expected a {' or '.join(kind.__name__.lower() for kind in kinds)} space, got {entry!r:.80}")
+        raise ValueError(
+            f"{name}: expected a {' or '.join(kind.__name__.lower() for kind in kinds)} space, got {entry!r:.80}"
+        )
     return space
 
 

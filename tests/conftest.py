@@ -11,8 +11,8 @@ from jax.experimental.compilation_cache import compilation_cache
 from train_fakes import FakeLearner
 from train_runs import SMALL, Make
 
+from dreamer_spec.options import Options, make_options
 from spec import hyperparameters
-from train.options import Options, make_options
 
 
 @pytest.fixture(autouse=True)
@@ -32,9 +32,17 @@ def make(tmp_path: Path) -> Iterator[Make]:
 
     def options(**given: Any) -> Options:
         overrides = {**SMALL, **{name: given.pop(name) for name in list(given) if name in hyperparameters()}}
-        plain = {"task": "train_fakes:Counting", "steps": 60, "logdir": tmp_path / "run", "preflight": False, "log_every": 0.0}
+        plain = {
+            "task": "train_fakes:Counting",
+            "steps": 60,
+            "logdir": tmp_path / "run",
+            "preflight": False,
+            "log_every": 0.0,
+        }
         plain["replay_deter"] = "float32"  # Latents say which call made them.
-        return make_options("jax", {**plain, "eval_every": 0, "eval_episodes": 0, "random_episodes": 0, **given}, overrides)
+        return make_options(
+            "jax", {**plain, "eval_every": 0, "eval_episodes": 0, "random_episodes": 0, **given}, overrides
+        )
 
     yield options
     FakeLearner.loss = 1.0
@@ -42,8 +50,12 @@ def make(tmp_path: Path) -> Iterator[Make]:
 
 @pytest.fixture(scope="module")
 def compile_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """JAX learners with the same configuration compile the same programs, whatever their seed: once in a file of tests."""
-    settings = {"jax_compilation_cache_dir": str(tmp_path_factory.mktemp("compiled")), "jax_persistent_cache_min_compile_time_secs": 0.0}
+    """JAX learners with the same configuration compile the same programs, whatever their seed: once in a file of
+    tests."""
+    settings = {
+        "jax_compilation_cache_dir": str(tmp_path_factory.mktemp("compiled")),
+        "jax_persistent_cache_min_compile_time_secs": 0.0,
+    }
     before = {name: getattr(jax.config, name) for name in settings}
     for values in (settings, before):
         for name, value in values.items():

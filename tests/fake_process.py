@@ -1,6 +1,7 @@
 """An implementation behind the process door that shares no code with the kit, and that misbehaves as its argument says.
 
-It knows symlog, refuses what is not finite, and holds every message in both directions against the schema of the protocol.
+It knows symlog, refuses what is not finite, and holds every message in both directions against the schema of the
+protocol.
 """
 
 import base64
@@ -14,7 +15,9 @@ from pathlib import Path
 
 import jsonschema
 
-SCHEMA = json.loads((Path(__file__).resolve().parent.parent / "conformance" / "protocol.schema.json").read_text(encoding="utf-8"))
+SCHEMA = json.loads(
+    (Path(__file__).resolve().parent.parent / "conformance" / "protocol.schema.json").read_text(encoding="utf-8")
+)
 VALIDATORS = {
     name: jsonschema.Draft202012Validator({"$ref": f"#/$defs/{name}", "$defs": SCHEMA["$defs"]})
     for name in ("request", "start_reply", "edition_reply", "run_reply", "stop_reply", "error_reply")
@@ -40,7 +43,11 @@ def symlog(x):
 
 def result_of(request):
     if request["method"] == "start":
-        functions = [f"f{n}" for n in range(1_000_000)] if MODE == "a million functions" else ["symlog", "kl_losses", "an_extra"]
+        functions = (
+            [f"f{n}" for n in range(1_000_000)]
+            if MODE == "a million functions"
+            else ["symlog", "kl_losses", "an_extra"]
+        )
         name = "fake" * 10**6 if MODE == "long name" else "fake"
         return {"protocol": 1, "name": name, "version": "0.1", "functions": functions}
     if request["method"] == "edition":
@@ -98,11 +105,14 @@ def misbehave(reply):
             "unknown dtype": reply.replace("float64", "float8"),
             "text": reply.partition(",")[0] + ', "result": "fine"}',
             "a list as kind": reply.partition(",")[0] + ', "error": {"kind": ["ValueError"], "message": "x"}}',
-            "long error": reply.partition(",")[0] + f', "error": {{"kind": "{"k" * LONG}", "message": "{"x" * LONG}"}}}}',
-            "long refusal": reply.partition(",")[0] + f', "error": {{"kind": "ValueError", "message": "{"x" * LONG}"}}}}',
+            "long error": reply.partition(",")[0]
+            + f', "error": {{"kind": "{"k" * LONG}", "message": "{"x" * LONG}"}}}}',
+            "long refusal": reply.partition(",")[0]
+            + f', "error": {{"kind": "ValueError", "message": "{"x" * LONG}"}}}}',
             "many values": reply.partition(",")[0] + f', "result": [{"[]," * 300_000}[]]}}',
             "huge number": reply.partition(",")[0] + f', "result": {10**40}}}',
-            "impossible shape": reply.partition(",")[0] + f', "result": {{"dtype": "float64", "shape": [0, {10**30}], "data": ""}}}}',
+            "impossible shape": reply.partition(",")[0]
+            + f', "result": {{"dtype": "float64", "shape": [0, {10**30}], "data": ""}}}}',
             "null": reply.partition(",")[0] + ', "result": null}',
         }.get(MODE, reply)
         + "\n"

@@ -1,6 +1,8 @@
-"""Run first in a process: hides from our code what Linux has and other systems do not. The packages that we use are imported before.
+"""Run first in a process: hides from our code what Linux has and other systems do not. The packages that we use are
+imported before.
 
-What cannot be pretended: that a file which is open or mapped can be neither removed nor renamed (Windows), paths, and other processes.
+What cannot be pretended: that a file which is open or mapped can be neither removed nor renamed (Windows), paths, and
+other processes.
 """
 
 import builtins
@@ -20,7 +22,10 @@ from PIL import Image  # noqa: F401
 from torch.utils.tensorboard.writer import SummaryWriter  # noqa: F401
 
 MODULES = ("fcntl", "resource", "pwd", "grp", "termios", "pty", "tty")
-CALLS = "sysconf sched_getaffinity getuid geteuid getgid pread pwrite posix_fallocate fork forkpty setsid killpg getpgid openpty "
+CALLS = (
+    "sysconf sched_getaffinity getuid geteuid getgid pread pwrite posix_fallocate fork "
+    "forkpty setsid killpg getpgid openpty "
+)
 CALLS += "O_NOFOLLOW O_NONBLOCK O_DIRECTORY O_CLOEXEC O_ASYNC getloadavg nice uname"
 SIGNALS = "SIGHUP SIGKILL SIGALRM SIGUSR1 SIGUSR2 SIGCHLD SIGPIPE SIGQUIT setitimer alarm pthread_sigmask siginterrupt"
 

@@ -1,4 +1,5 @@
-"""The reference as a file for the server, with the namespaces of the protocol made into the objects of the specification again."""
+"""The reference as a file for the server, with the namespaces of the protocol made into the objects of the
+specification again."""
 
 import dataclasses
 
@@ -16,7 +17,11 @@ def restored(value):
     if isinstance(value, tuple):
         return tuple(map(restored, value))
     kind = KINDS.get(getattr(value, "kind", None))
-    return kind(**{field.name: restored(getattr(value, field.name)) for field in dataclasses.fields(kind)}) if kind else value
+    return (
+        kind(**{field.name: restored(getattr(value, field.name)) for field in dataclasses.fields(kind)})
+        if kind
+        else value
+    )
 
 
 def offered(name):

@@ -13,10 +13,17 @@ from unittest import mock
 import hypothesis.strategies as st
 import numpy as np
 from hypothesis import HealthCheck, Phase, settings
-from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule, run_state_machine_as_test
+from hypothesis.stateful import (
+    RuleBasedStateMachine,
+    initialize,
+    invariant,
+    precondition,
+    rule,
+    run_state_machine_as_test,
+)
 
+from dreamer_spec.replay import Replay
 from reference_numpy.replay import Replay as Naive
-from train.replay import Replay
 
 WORKERS = 3
 SEEDS = st.integers(0, 2**32 - 1)
@@ -155,8 +162,12 @@ class ReplayMachine(RuleBasedStateMachine):
     @rule()
     def compare_everything(self) -> None:
         actual, expected = self.replay.state_dict(), self.naive.state_dict()
-        if not len(self.naive):  # Without an item there are no records either, and only the reference knows their form by then.
-            actual, expected = ({key: value for key, value in state.items() if "/" not in key} for state in (actual, expected))
+        if not len(
+            self.naive
+        ):  # Without an item there are no records either, and only the reference knows their form by then.
+            actual, expected = (
+                {key: value for key, value in state.items() if "/" not in key} for state in (actual, expected)
+            )
         assert_same(actual, expected)
 
     @rule(kept=st.sampled_from([3, 2, 1]))
@@ -207,7 +218,8 @@ class ReplayMachine(RuleBasedStateMachine):
         again: bool,
         saved_again: bool,
     ) -> None:
-        """After some more life the process dies while it does something; one of the saves is restored: the last, if it is not damaged."""
+        """After some more life the process dies while it does something; one of the saves is restored: the last, if it
+        is not damaged."""
         for number, what in enumerate(["save", *lives] if not self.saves else lives):
             if what == "save":
                 self.save(3)
@@ -255,7 +267,9 @@ class ReplayMachine(RuleBasedStateMachine):
             self.restored(self.replay.directory, description, continue_streams)
 
     def restored(self, directory: Path, description: dict[str, Any], continue_streams: bool) -> Replay:
-        return Replay.restore(directory, description, self.capacity, self.length, continue_streams=continue_streams, **self.settings)
+        return Replay.restore(
+            directory, description, self.capacity, self.length, continue_streams=continue_streams, **self.settings
+        )
 
     @invariant()
     def same_length(self) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from train.replay import batches, buffer, items, journal, recovery, saves, storage
+from dreamer_spec.replay import batches, buffer, items, journal, recovery, saves, storage
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,13 +44,23 @@ MISTAKES = [
         "(position + 1) % (self.length + 1) == 0",
     ),
     Mistake("item 0 is the newest", Items, "draw", "int(u * self._count)", "self._count - 1 - int(u * self._count)"),
-    Mistake("one item too many is kept", Replay, "add_packed", "len(self.items) == self.capacity", "len(self.items) > self.capacity"),
+    Mistake(
+        "one item too many is kept",
+        Replay,
+        "add_packed",
+        "len(self.items) == self.capacity",
+        "len(self.items) > self.capacity",
+    ),
     Mistake("evicted records take a write-back", Replay, "write_back", "max(start + 1, stream.first)", "start + 1"),
     Mistake("the context is overwritten too", Replay, "write_back", "start + 1", "start"),
     Mistake("evicted entries of the queue are served", Items, "pop_oldest", "self.queue.popleft()", "pass"),
     Mistake("the previous action is the action", batches, "_unpack", "records[key][:, :-1]", "records[key][:, 1:]"),
-    Mistake("an abandoned episode goes on", batches, "_unpack", '|= batch["is_first"][:, 1:]', '|= batch["is_last"][:, 1:]'),
-    Mistake("a row after a chunk's end comes one too early", buffer, "gather", "span.done - 1 + context :", "span.done :"),
+    Mistake(
+        "an abandoned episode goes on", batches, "_unpack", '|= batch["is_first"][:, 1:]', '|= batch["is_last"][:, 1:]'
+    ),
+    Mistake(
+        "a row after a chunk's end comes one too early", buffer, "gather", "span.done - 1 + context :", "span.done :"
+    ),
     Mistake(
         "the second chunk is read from the first one's row",
         Storage,
@@ -83,11 +93,27 @@ MISTAKES = [
         "reversed([number for number in journal_epochs(directory) if number >= epoch])",
         "[number for number in journal_epochs(directory) if number >= epoch]",
     ),
-    Mistake("only the last epoch is undone", recovery, "_undo", "number >= epoch", "number == max(journal_epochs(directory))"),
     Mistake(
-        "what was touched stays touched", recovery, "save", "chunk.saved, chunk.touched = chunk.count, None", "chunk.saved = chunk.count"
+        "only the last epoch is undone",
+        recovery,
+        "_undo",
+        "number >= epoch",
+        "number == max(journal_epochs(directory))",
     ),
-    Mistake("what is saved is not remembered", recovery, "save", "chunk.saved, chunk.touched = chunk.count, None", "chunk.touched = None"),
+    Mistake(
+        "what was touched stays touched",
+        recovery,
+        "save",
+        "chunk.saved, chunk.touched = chunk.count, None",
+        "chunk.saved = chunk.count",
+    ),
+    Mistake(
+        "what is saved is not remembered",
+        recovery,
+        "save",
+        "chunk.saved, chunk.touched = chunk.count, None",
+        "chunk.touched = None",
+    ),
     Mistake("the newest records are not written", recovery, "save", "storage.write_stage(stream)", "pass"),
     Mistake("checksums of latents grow old", recovery, "save", "storage.sum_latents(chunk)", "pass"),
     Mistake("chunks go though a save needs them", History, "retire", "return not needed", "return True"),
@@ -99,10 +125,14 @@ MISTAKES = [
         "epoch != self.epoch",
     ),
     Mistake("the journal is emptied before later ones are gone", History, "resume", "later > epoch", "False"),
-    Mistake("a later save survives the restore", recovery, "restore", "saved_path(replay.directory, epoch).unlink()", "pass"),
+    Mistake(
+        "a later save survives the restore", recovery, "restore", "saved_path(replay.directory, epoch).unlink()", "pass"
+    ),
     Mistake("the queue does not come back", recovery, "_rebuild", "replay.items.queue.extend(", "list("),
     Mistake("the unfinished block is not loaded", recovery, "_held", "storage.read_stage(stream)", "pass"),
-    Mistake("numbers of streams are used again", recovery, "restore", 'replay.next_stream = facts["next_stream"]', "pass"),
+    Mistake(
+        "numbers of streams are used again", recovery, "restore", 'replay.next_stream = facts["next_stream"]', "pass"
+    ),
     Mistake(
         "streams go on after a restart",
         Replay,
@@ -110,5 +140,11 @@ MISTAKES = [
         "self.clear()",
         "current = dict(self.current); self.clear(); self.current = current",
     ),
-    Mistake("an entry of the journal is torn", journal.Journal, "append", "write_all(self._fd, data, self._size + len(header))", "pass"),
+    Mistake(
+        "an entry of the journal is torn",
+        journal.Journal,
+        "append",
+        "write_all(self._fd, data, self._size + len(header))",
+        "pass",
+    ),
 ]

@@ -1,4 +1,5 @@
-"""A small adapter with a pass, a failure, an error and a function that is not offered, and the result of checking it."""
+"""A small adapter with a pass, a failure, an error and a function that is not offered, and the result of checking
+it."""
 
 import types
 from collections.abc import Mapping
@@ -53,7 +54,14 @@ def rms_norm(x, scale, epsilon):
 
 
 def settings(**changes: Any) -> Settings:
-    base = {"candidate": "mine.py", "process": False, "dtype": "float64", "device": None, "edition": "paper", "only": ""}
+    base = {
+        "candidate": "mine.py",
+        "process": False,
+        "dtype": "float64",
+        "device": None,
+        "edition": "paper",
+        "only": "",
+    }
     return Settings(**{**base, "seed": 3, "examples": 5, "at_least": 1, **changes})
 
 
@@ -63,7 +71,9 @@ def adapter(source: str = ADAPTER) -> ModuleAdapter:
     return ModuleAdapter(module, "float64")
 
 
-def make(names: tuple[str, ...] = (PASS, FAIL, ERROR, ABSENT), reasons: Mapping[str, str] | None = None, **changes: Any) -> dict[str, Any]:
+def make(
+    names: tuple[str, ...] = (PASS, FAIL, ERROR, ABSENT), reasons: Mapping[str, str] | None = None, **changes: Any
+) -> dict[str, Any]:
     asked = settings(**changes)
     results = [run_check(CHECKS[name], adapter(), "float64", "paper", asked.seed, asked.examples) for name in names]
     return result_data(

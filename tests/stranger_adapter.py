@@ -29,7 +29,9 @@ def kl_losses(posterior_logits, prior_logits, config):
 
 
 def core(params, deter, stoch, action, config):
-    cell = code.Cell(config.deter, config.stoch * config.classes, action.shape[-1], config.units, config.blocks, config.norm_epsilon)
+    cell = code.Cell(
+        config.deter, config.stoch * config.classes, action.shape[-1], config.units, config.blocks, config.norm_epsilon
+    )
     state = {f"mix.{part}": params[f"rssm/hidden/{name}"] for part, name in (("0.bias", "bias"), ("1.weight", "scale"))}
     state["mix.0.weight"] = params["rssm/hidden/kernel"].mT
     state |= {"gates.weight": params["rssm/gru/kernel"].mT, "gates.bias": params["rssm/gru/bias"]}

@@ -1,4 +1,5 @@
-"""A code base as a stranger might write it: PyTorch, time first, names, layouts and habits of its own. It knows nothing of the kit."""
+"""A code base as a stranger might write it: PyTorch, time first, names, layouts and habits of its own. It knows nothing
+of the kit."""
 
 import torch
 from torch import nn
@@ -80,7 +81,9 @@ class Cell(nn.Module):
     def forward(self, h, z, action):
         action = action / action.abs().clamp(min=1).detach()
         x = torch.cat([layer(value) for layer, value in zip(self.inputs, (h, z, action), strict=True)], -1)
-        x = torch.cat([h.unflatten(-1, (self.blocks, -1)), x[..., None, :].expand(*x.shape[:-1], self.blocks, -1)], -1).flatten(-2)
+        x = torch.cat(
+            [h.unflatten(-1, (self.blocks, -1)), x[..., None, :].expand(*x.shape[:-1], self.blocks, -1)], -1
+        ).flatten(-2)
         reset, cand, update = self.gates(self.mix(x)).unflatten(-1, (self.blocks, 3, -1)).unbind(-2)
         cand = torch.tanh(reset.flatten(-2).sigmoid() * cand.flatten(-2))
         update = (update.flatten(-2) - 1).sigmoid()

@@ -47,7 +47,9 @@ def test_a_norm_reads_its_scale_in_bfloat16_and_has_its_gradient_in_float32(back
     assert not np.array_equal(by_scale, torch.tensor(by_scale).bfloat16().float().numpy())
 
 
-def _norm_and_gradients(backend: str, function: str, x: np.ndarray, scale: np.ndarray, by_y: np.ndarray) -> list[np.ndarray]:
+def _norm_and_gradients(
+    backend: str, function: str, x: np.ndarray, scale: np.ndarray, by_y: np.ndarray
+) -> list[np.ndarray]:
     """Value of the norm of x in bfloat16, and the gradients by x and scale."""
     if backend == "jax":
         norm = jax_layers.rms_norm if function == "rms_norm" else jax_layers.activate

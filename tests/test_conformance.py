@@ -13,14 +13,21 @@ from impl_torch import layers
 
 def marks(backend: str, dtype: str, profile: str, check: Check) -> list[pytest.MarkDecorator]:
     # JAX compiles every function and shape anew, so that it gets one pass here; PyTorch gets both profiles and float32.
-    quick = (dtype == "float64" and profile == "paper") or (backend == "torch" and (dtype, profile) != ("float32", "official"))
+    quick = (dtype == "float64" and profile == "paper") or (
+        backend == "torch" and (dtype, profile) != ("float32", "official")
+    )
     quick = quick and dtype != "bfloat16"
     return [pytest.mark.xdist_group(f"{backend}-{dtype}"), *([] if quick else [pytest.mark.slow])]
 
 
 CASES = [
     pytest.param(
-        backend, dtype, profile, check, id=f"{backend}-{dtype}-{profile}-{check.name}", marks=marks(backend, dtype, profile, check)
+        backend,
+        dtype,
+        profile,
+        check,
+        id=f"{backend}-{dtype}-{profile}-{check.name}",
+        marks=marks(backend, dtype, profile, check),
     )
     for backend in ("jax", "torch")
     for dtype in DTYPES
@@ -36,7 +43,9 @@ def test_the_backend_passes(backend: str, dtype: str, profile: str, check: Check
 
 
 ROUTED = [
-    check for check in selected_checks("float32") if {"linear", "block_linear", "observe", "imagine", "train_step"}.intersection(check.uses)
+    check
+    for check in selected_checks("float32")
+    if {"linear", "block_linear", "observe", "imagine", "train_step"}.intersection(check.uses)
 ]
 
 

@@ -31,7 +31,10 @@ def helper(): ...
 def test_marks_are_found(tmp_path: Path) -> None:
     (tmp_path / "test_a.py").write_text(MARKED)
     (tmp_path / "helpers.py").write_text(MARKED)
-    assert covering_tests(tmp_path) == {"LOOP-1": ["test_a.test_both", "test_a.test_inside"], "CON-2": ["test_a.test_both"]}
+    assert covering_tests(tmp_path) == {
+        "LOOP-1": ["test_a.test_both", "test_a.test_inside"],
+        "CON-2": ["test_a.test_both"],
+    }
     assert covering_tests(tmp_path / "absent") == {}
 
 

@@ -1,4 +1,5 @@
-"""The diagnosis names the mistake: of every mutant as if a stranger had written it, of backends, and of nothing where there is nothing."""
+"""The diagnosis names the mistake: of every mutant as if a stranger had written it, of backends, and of nothing where
+there is nothing."""
 
 import dataclasses
 import functools
@@ -33,7 +34,9 @@ def diagnosed(name: str) -> list[Diagnosis]:
     return diagnose(MutantAdapter(mutant), results + unmoved, "float64", "paper", 0, EXAMPLES)
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=[] if name in FAST else pytest.mark.slow) for name in MUTANTS])
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[] if name in FAST else pytest.mark.slow) for name in MUTANTS]
+)
 def test_the_mutant_is_named(name: str) -> None:
     first, *others = diagnosed(name)
     assert (first.mutant.name, first.alternatives, first.unexplained, others) == (name, (), (), [])
@@ -57,7 +60,9 @@ def test_a_mistake_in_a_backend_is_named(dtype: str, monkeypatch: pytest.MonkeyP
 
     for module in (torch_returns, torch_agent):
         monkeypatch.setattr(module, "lambda_return", wrong)
-    (found,) = diagnose_in(load_adapter("torch", dtype), "lambda_return_literals", "lambda_return_matches", "losses_match", dtype=dtype)
+    (found,) = diagnose_in(
+        load_adapter("torch", dtype), "lambda_return_literals", "lambda_return_matches", "losses_match", dtype=dtype
+    )
     assert (found.mutant.name, found.alternatives, found.unexplained) == ("return_without_continue", (), ())
     assert {"returns.lambda_return_literals", "agent.losses_match"} <= set(found.explained)
 
@@ -65,7 +70,9 @@ def test_a_mistake_in_a_backend_is_named(dtype: str, monkeypatch: pytest.MonkeyP
 def test_a_missing_gradient_in_a_backend_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     """The losses are right, and only their derivatives tell."""
     right = torch_world_model.kl_losses
-    monkeypatch.setattr(torch_world_model, "kl_losses", functools.wraps(right)(lambda *arguments: right(*arguments)[::-1]))
+    monkeypatch.setattr(
+        torch_world_model, "kl_losses", functools.wraps(right)(lambda *arguments: right(*arguments)[::-1])
+    )
     (found,) = diagnose_in(load_adapter("torch", "float32"), "losses_match", "constants_of_the_kl", dtype="float32")
     assert (found.mutant.name, found.alternatives, found.unexplained) == ("kl_stop_gradients_swapped", (), ())
 
@@ -88,7 +95,8 @@ def test_mutants_that_cannot_be_told_apart_are_listed(monkeypatch: pytest.Monkey
 
 
 def test_passing_checks_tell_mutants_apart(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A mutant that gives the same wrong numbers, and others in a check that the candidate passes, is not its mistake."""
+    """A mutant that gives the same wrong numbers, and others in a check that the candidate passes, is not its
+    mistake."""
     slow, returns = MUTANTS["slow_critic_decay_swapped"], MUTANTS["return_without_discount"]
     both = dataclasses.replace(slow, name="both", edits={**slow.edits, **returns.edits})
     monkeypatch.setitem(MUTANTS, "both", both)
@@ -136,7 +144,10 @@ def test_the_words_of_a_diagnosis() -> None:
     (found,) = diagnose_in(MutantAdapter(MUTANTS["return_bootstraps_from_itself"]), "returns.lambda_return_literals")
     assert found.to_json() == {
         "mutant": "return_bootstraps_from_itself",
-        "explanation": "lambda-return bootstraps from its own value: reward, continue and value are those of the state that is left",
+        "explanation": (
+            "lambda-return bootstraps from its own value: reward, continue and value "
+            "are those of the state that is left"
+        ),
         "provenance": "the paper's printed indices (D-03); NaturalDreamer and naivoder's implementation",
         "chapter": "spec/07-returns.md",
         "requirements": ["RET-1", "CON-13"],

@@ -16,11 +16,11 @@ import yaml
 from packaging.requirements import Requirement
 from packaging.version import Version
 
-from train.envs import factory
+from dreamer_spec.envs import factory
 
 ROOT = Path(__file__).resolve().parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-PACKAGES = ("spec", "reference_numpy", "impl_jax", "impl_torch", "conformance", "train")
+PACKAGES = ("spec", "reference_numpy", "impl_jax", "impl_torch", "conformance", "dreamer_spec")
 NOT_SOURCES = (".git", ".venv*", ".*_cache", ".hypothesis", "__pycache__", "build", "dist", "runs", "*.egg-info")
 
 
@@ -103,23 +103,48 @@ def test_an_installation_finds_every_page_that_its_files_name(wheel: Path, tmp_p
 def test_every_extra_that_a_text_recommends_exists() -> None:
     """dreamer-spec[NAME] and '.[NAME]', and further [NAME] on such a line of the README."""
     known = set(PROJECT["optional-dependencies"])
-    passed = {*factory._EXTRAS.values(), *(extra for _, extra in factory._NAMESPACES.values()), *extras_passed_in_factory()}
+    passed = {
+        *factory._EXTRAS.values(),
+        *(extra for _, extra in factory._NAMESPACES.values()),
+        *extras_passed_in_factory(),
+    }
     backends = {"jax", "torch"}
-    placeholders = {"{extra}": passed, "{backend}": backends, "{info['backend']}": backends, "{name}": backends, "$(RANGES)": set()}
-    documents = [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("spec/*.md"), *ROOT.glob(".github/workflows/*")]
+    placeholders = {
+        "{extra}": passed,
+        "{backend}": backends,
+        "{info['backend']}": backends,
+        "{name}": backends,
+        "$(RANGES)": set(),
+    }
+    documents = [
+        *ROOT.glob("*.md"),
+        *ROOT.glob("docs/*.md"),
+        *ROOT.glob("spec/*.md"),
+        *ROOT.glob(".github/workflows/*"),
+    ]
     found = set()
-    for path in [*sources("*.py", "*.toml"), *ROOT.glob("benchmarks/*.py"), *documents, ROOT / "pyproject.toml", ROOT / "Makefile"]:
+    for path in [
+        *sources("*.py", "*.toml"),
+        *ROOT.glob("benchmarks/*.py"),
+        *documents,
+        ROOT / "pyproject.toml",
+        ROOT / "Makefile",
+    ]:
         text = path.read_text(encoding="utf-8")
         recommended = re.findall(r"""(?:dreamer-spec|['" ]\.)\[([^\s"]*[^\s"'])\]""", text)
-        recommended += re.findall(r"(?<!\w)\[([\w-]+)\]", "".join(re.findall(r"^pip install '\.\[.*$", text, re.MULTILINE)))
+        recommended += re.findall(
+            r"(?<!\w)\[([\w-]+)\]", "".join(re.findall(r"^pip install '\.\[.*$", text, re.MULTILINE))
+        )
         for name in ",".join(recommended).split(",") if recommended else []:
-            assert placeholders.get(name, {name}) <= known, f"{path.relative_to(ROOT)} recommends [{name}], which is no extra"
+            assert placeholders.get(name, {name}) <= known, (
+                f"{path.relative_to(ROOT)} recommends [{name}], which is no extra"
+            )
             found.add(name)
     assert {"{extra}", "{backend}", "jax", "torch", "box2d", "wandb", "dev"} <= found
 
 
 def extras_passed_in_factory() -> set[str]:
-    """Every literal that train/envs/factory.py passes as a parameter `extra`."""
+    """Every literal that dreamer_spec/envs/factory.py passes as a parameter `extra`."""
     tree = ast.parse(Path(factory.__file__).read_text(encoding="utf-8"))
     definitions = (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef))
     functions = {node.name: [argument.arg for argument in node.args.args] for node in definitions}
@@ -215,7 +240,9 @@ def test_the_citation_is_complete() -> None:
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
     assert {"cff-version", "message", "title", "authors"} <= set(citation)
     assert (citation["cff-version"], citation["type"]) == ("1.2.0", "software")
-    assert [citation[key] for key in ("title", "version", "license")] == [PROJECT[key] for key in ("name", "version", "license")]
+    assert [citation[key] for key in ("title", "version", "license")] == [
+        PROJECT[key] for key in ("name", "version", "license")
+    ]
     assert [author["name"] for author in citation["authors"]] == [author["name"] for author in PROJECT["authors"]]
     [paper] = citation["references"]
     assert {"type", "title", "authors"} <= set(paper)

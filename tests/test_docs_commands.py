@@ -1,7 +1,8 @@
 """Every command line of the documents runs as it is printed.
 
-What lies between ```sh and ``` is taken from the documents themselves, so a new line is tested without a word here. Appended options make
-runs short; what a line needs beside the repository, such as a run or an adapter, is prepared in a folder of its own.
+What lies between ```sh and ``` is taken from the documents themselves, so a new line is tested without a word here.
+Appended options make runs short; what a line needs beside the repository, such as a run or an adapter, is prepared in a
+folder of its own.
 """
 
 import importlib
@@ -16,13 +17,20 @@ from pathlib import Path
 
 import pytest
 
-from train.cli import main, parse_runs
+from dreamer_spec.cli import main, parse_runs
 
 ROOT = Path(__file__).resolve().parent.parent
-DOCUMENTS = [ROOT / name for name in ("README.md", "CONTRIBUTING.md")] + sorted(ROOT.glob("docs/*.md")) + sorted(ROOT.glob("spec/*.md"))
+DOCUMENTS = (
+    [ROOT / name for name in ("README.md", "CONTRIBUTING.md")]
+    + sorted(ROOT.glob("docs/*.md"))
+    + sorted(ROOT.glob("spec/*.md"))
+)
 BIN = Path(sys.executable).parent
 
-TRAIN = "--size tiny --deter 16 --units 8 --envs 1 --batch-size 2 --batch-length 4 --replay-ratio 1 --steps 40 --image-size 16"
+TRAIN = (
+    "--size tiny --deter 16 --units 8 --envs 1 --batch-size 2 --batch-length 4 "
+    "--replay-ratio 1 --steps 40 --image-size 16"
+)
 TRAIN += " --eval-every 0 --eval-episodes 1 --random-episodes 1 --no-preflight"
 
 # Begin of a line -> what is appended to it, so that it takes seconds. A second line begins with it: the longest fits.
@@ -43,13 +51,20 @@ NOT_HERE = {
     "pip install": "downloads",
     "export ": "sets variables for the lines after it",
 }
-SLOW = ("conformance lockstep", "conformance mutants", "python -m benchmarks", "train --backend jax")  # compile, or take a minute
+SLOW = (
+    "conformance lockstep",
+    "conformance mutants",
+    "python -m benchmarks",
+    "train --backend jax",
+)  # compile, or take a minute
 FAILURES = {0, 1}  # of `conformance check`: 1 says that the candidate deviates, which an adapter of two functions does
 
 
 def lines(document: Path) -> list[str]:
     """The command lines of a document, without comments, and those that go on in the next line joined."""
-    blocks = re.findall(r"^```(?:sh|bash|console)\n(.*?)^```", document.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+    blocks = re.findall(
+        r"^```(?:sh|bash|console)\n(.*?)^```", document.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
+    )
     found = (line.strip() for block in blocks for line in block.replace("\\\n", " ").splitlines())
     return [re.sub(r"\s+#.*$", "", line) for line in found if line and not line.startswith("#")]
 
@@ -83,7 +98,9 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What the lines name: runs, an adapter, results of it, an environment, other programs."""
     folder = tmp_path_factory.mktemp("prepared")
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    (adapter,) = re.findall(r"^```python\n(import numpy as np\nfrom my_dreamer import .*?)^```", readme, re.MULTILINE | re.DOTALL)
+    (adapter,) = re.findall(
+        r"^```python\n(import numpy as np\nfrom my_dreamer import .*?)^```", readme, re.MULTILINE | re.DOTALL
+    )
     (folder / "my_adapter.py").write_text(adapter)
     (folder / "my_dreamer.py").write_text("from reference_numpy import returns, transforms\n\nlosses = transforms\n")
     with (folder / "my_dreamer.py").open("a") as file:
@@ -99,7 +116,8 @@ def make_env(level=1, goals=()):
 
     cartpole = gymnasium.make("CartPole-v1")
     box = cartpole.observation_space
-    parts = {"arm_angle": box, "camera": spaces.Box(box.low[:2], box.high[:2]), "debug_time": spaces.Box(box.low[:1], box.high[:1])}
+    first, two = spaces.Box(box.low[:1], box.high[:1]), spaces.Box(box.low[:2], box.high[:2])
+    parts = {"arm_angle": box, "camera": two, "debug_time": first}
     return gymnasium.wrappers.TransformObservation(cartpole, seen, spaces.Dict(parts))
 """
     )
@@ -129,7 +147,9 @@ def run(folder: Path, line: str, codes: set[int] | None = None) -> str:
     """Runs a line in a shell that finds our commands, and returns what it printed."""
     paths = [str(folder / "bin"), str(BIN), os.environ["PATH"]]
     environment = os.environ | {"PATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(["bash", "-c", line], cwd=folder, env=environment, capture_output=True, text=True, timeout=1200)
+    done = subprocess.run(
+        ["bash", "-c", line], cwd=folder, env=environment, capture_output=True, text=True, timeout=1200
+    )
     assert done.returncode in (codes or {0}), f"{line}\n{done.stdout[-2000:]}\n{done.stderr[-4000:]}"
     assert "Traceback" not in done.stderr, done.stderr
     return done.stdout
@@ -142,7 +162,9 @@ def test_a_line_runs_as_it_is_printed(prepared: Path, tmp_path: Path, line: str)
     if line.startswith("conformance new-adapter"):
         (folder / "my_adapter.py").unlink()  # it writes a new one, and replaces none
     if line.startswith("conformance lockstep"):
-        shutil.copy(ROOT / "tests" / "reference_adapter.py", folder / "my_adapter.py")  # whole train steps, not two functions
+        shutil.copy(
+            ROOT / "tests" / "reference_adapter.py", folder / "my_adapter.py"
+        )  # whole train steps, not two functions
     shorter = longest(SHORTER, line)
     separator = " --" if line.startswith("python -m benchmarks.learning") and " -- " not in line else ""
     line = line.replace("/opt/old_env/", "ENV/")
@@ -150,7 +172,9 @@ def test_a_line_runs_as_it_is_printed(prepared: Path, tmp_path: Path, line: str)
 
 
 @pytest.mark.parametrize("line", [line for _, line in COMMANDS if line.startswith("train --")])
-def test_a_line_that_trains_runs_with_pytorch(prepared: Path, tmp_path: Path, line: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_line_that_trains_runs_with_pytorch(
+    prepared: Path, tmp_path: Path, line: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """As printed but for the backend: JAX compiles for longer than CI should wait. As printed they are slow tests."""
     assert parse_runs(shlex.split(line)[1:])
     shutil.copytree(prepared / "runs", tmp_path / "runs")
@@ -161,8 +185,14 @@ def test_a_line_that_trains_runs_with_pytorch(prepared: Path, tmp_path: Path, li
 
 def test_lines_inside_of_sentences_are_understood() -> None:
     """`train --backend ...` between backticks: its options exist, and its values are values."""
-    found = [words for document in DOCUMENTS for words in re.findall(r"`(train --[^`]+)`", document.read_text(encoding="utf-8"))]
-    complete = [" ".join(words.split()) for words in found if "--backend" in words and "|" not in words and "..." not in words]
+    found = [
+        words
+        for document in DOCUMENTS
+        for words in re.findall(r"`(train --[^`]+)`", document.read_text(encoding="utf-8"))
+    ]
+    complete = [
+        " ".join(words.split()) for words in found if "--backend" in words and "|" not in words and "..." not in words
+    ]
     assert len(complete) >= 3
     for words in complete:
         assert parse_runs(shlex.split(words)[1:]), words
@@ -171,7 +201,9 @@ def test_lines_inside_of_sentences_are_understood() -> None:
 def test_modules_inside_of_sentences_are_there() -> None:
     """`python -m benchmarks.loop ...`: it can be imported, and so can all that it needs."""
     names = {
-        name for document in DOCUMENTS for name in re.findall(r"python -m ([a-z_]+\.[a-z_.]*[a-z_])", document.read_text(encoding="utf-8"))
+        name
+        for document in DOCUMENTS
+        for name in re.findall(r"python -m ([a-z_]+\.[a-z_.]*[a-z_])", document.read_text(encoding="utf-8"))
     }
     assert len(names) >= 6
     for name in names - {"conformance.serve"}:  # a server begins when it is imported

@@ -6,9 +6,9 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
+from dreamer_spec.envs import ContractEnv
+from dreamer_spec.envs.adapter import array_spaces
 from spec import Discrete
-from train.envs import ContractEnv
-from train.envs.adapter import array_spaces
 
 
 class LegalMoves(gymnasium.Wrapper):
@@ -17,7 +17,9 @@ class LegalMoves(gymnasium.Wrapper):
     def __init__(self, env: gymnasium.Env, penalty: float = 0.02) -> None:
         super().__init__(env)
         self._penalty = penalty
-        self.observation_space = spaces.Dict({"board": env.observation_space, "legal": spaces.MultiBinary(int(env.action_space.n))})
+        self.observation_space = spaces.Dict(
+            {"board": env.observation_space, "legal": spaces.MultiBinary(int(env.action_space.n))}
+        )
 
     def reset(self, **given):
         board, info = self.env.reset(**given)

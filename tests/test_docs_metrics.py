@@ -5,22 +5,32 @@ from pathlib import Path
 
 import pytest
 
-from train import loop
-from train.logger import iterate_metrics
-from train.options import make_options
-from train.report.catalogue import find, markdown, sections
+from dreamer_spec import loop
+from dreamer_spec.logger import iterate_metrics
+from dreamer_spec.options import make_options
+from dreamer_spec.report.catalogue import find, markdown, sections
 
 SPECIAL = {"memory/device", "episode/info/<key>", "evaluation/info/<key>"}  # with an accelerator, with --info-metrics
 
 TINY = {
     **{"batch_size": 2, "batch_length": 3, "units": 8, "deter": 8, "blocks": 1, "stoch": 2, "classes": 2, "bins": 5},
-    **{f"{part}_layers": 1 for part in ("encoder", "decoder", "posterior", "prior", "reward", "continue", "actor", "critic")},
+    **{
+        f"{part}_layers": 1
+        for part in ("encoder", "decoder", "posterior", "prior", "reward", "continue", "actor", "critic")
+    },
     **{"imagination_horizon": 2, "envs": 1, "replay_ratio": 6, "replay_capacity": 100},
 }
 
 
 def emitted(backend: str, logdir: Path) -> set[str]:
-    given = {"task": "gym:CartPole-v1", "logdir": logdir, "steps": 60, "eval_every": 30, "eval_episodes": 2, "random_episodes": 2}
+    given = {
+        "task": "gym:CartPole-v1",
+        "logdir": logdir,
+        "steps": 60,
+        "eval_every": 30,
+        "eval_episodes": 2,
+        "random_episodes": 2,
+    }
     settings = {**given, "size": "tiny", "preflight": False, "log_every": 0.0, "checkpoint_every": 0.0, "device": "cpu"}
     assert loop.run(make_options(backend, settings, TINY))
     lines = [line for line in iterate_metrics(logdir / "metrics.jsonl") if line is not None]

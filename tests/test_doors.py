@@ -47,13 +47,21 @@ def run(name: str, adapter: object, dtype: str = "float64") -> Result:
     return run_check(CHECKS[name], adapter, dtype, "paper", examples=5)
 
 
-# --- What comes back ---------------------------------------------------------------------------------------------------------------------
+# --- What comes back
+# ------------------------------------------------------------------------------
 
 
 def test_tensors_come_back_as_numpy() -> None:
     half = np.array([0.5, -2.0])
     tensor = torch.tensor(half, requires_grad=True)
-    for value in (tensor, tensor * 1, tensor.to(torch.bfloat16), tensor.float(), np.float16(half), load_jax().asarray(half, "bfloat16")):
+    for value in (
+        tensor,
+        tensor * 1,
+        tensor.to(torch.bfloat16),
+        tensor.float(),
+        np.float16(half),
+        load_jax().asarray(half, "bfloat16"),
+    ):
         array = to_numpy(value)
         assert isinstance(array, np.ndarray)
         np.testing.assert_array_equal(array, half)
@@ -94,7 +102,8 @@ def test_several_results_come_in_any_dress() -> None:
         (np.ones(2), "one array of shape \\[2\\]"),
     ):
         with pytest.raises(
-            TypeError, match=rf"kl_losses: expected a tuple \(dynamics, representation\) or a dict with these keys, got {got}"
+            TypeError,
+            match=rf"kl_losses: expected a tuple \(dynamics, representation\) or a dict with these keys, got {got}",
         ):
             arranged("kl_losses", losses, to_numpy(result))
     with pytest.raises(TypeError, match="symlog: expected one array, got a dict with the keys 'x'"):
@@ -110,8 +119,12 @@ def test_latents_come_flat_or_as_indices() -> None:
     onehot = np.eye(5)[indices]
     for latents in (onehot, onehot.reshape(2, 15), indices, indices.astype(np.int32)):
         np.testing.assert_array_equal(arranged("posterior", (CONFIG,), latents), onehot)
-        np.testing.assert_array_equal(arranged("observe", (CONFIG,), {"stoch": latents, "deter": indices})["stoch"], onehot)
-        np.testing.assert_array_equal(arranged("policy_step", (CONFIG,), ({"stoch": latents}, indices))[0]["stoch"], onehot)
+        np.testing.assert_array_equal(
+            arranged("observe", (CONFIG,), {"stoch": latents, "deter": indices})["stoch"], onehot
+        )
+        np.testing.assert_array_equal(
+            arranged("policy_step", (CONFIG,), ({"stoch": latents}, indices))[0]["stoch"], onehot
+        )
     assert arranged("observe", (CONFIG,), {"deter": indices})["deter"] is indices
     np.testing.assert_array_equal(arranged("categorical_sample", (np.zeros((2, 3, 5)), None), indices), onehot)
     np.testing.assert_array_equal(arranged("draw_categorical", (np.zeros((3, 5)), 0.0, 0, 2), indices), onehot)
@@ -123,7 +136,11 @@ def test_latents_come_flat_or_as_indices() -> None:
 
 
 def test_every_tuple_has_names() -> None:
-    annotated = {name for name in INTERFACE if str(inspect.signature(getattr(Adapter, name)).return_annotation).startswith("tuple")}
+    annotated = {
+        name
+        for name in INTERFACE
+        if str(inspect.signature(getattr(Adapter, name)).return_annotation).startswith("tuple")
+    }
     assert annotated == set(RESULTS)
     assert set(OBJECTS) < set(INTERFACE)
 
@@ -134,11 +151,17 @@ def lambda_return(reward: Any, continue_: Any, value: Any, discount: float, lamb
 
 def test_shapes_are_explained() -> None:
     """Expected, got, and the usual reason."""
-    swapped = run("returns.lambda_return_literals", module(lambda_return=lambda *arguments: lambda_return(*arguments).T))
+    swapped = run(
+        "returns.lambda_return_literals", module(lambda_return=lambda *arguments: lambda_return(*arguments).T)
+    )
     assert swapped.message == "lambda_return: expected shape (1, 3), got (3, 1): rows come first and time comes second"
-    longer = run("returns.lambda_return_literals", module(lambda_return=lambda *arguments: lambda_return(*arguments)[..., None]))
+    longer = run(
+        "returns.lambda_return_literals", module(lambda_return=lambda *arguments: lambda_return(*arguments)[..., None])
+    )
     assert longer.message == "lambda_return: expected shape (1, 3), got (1, 3, 1): leave out the last axis"
-    shorter = run("returns.lambda_return_literals", module(lambda_return=lambda *arguments: lambda_return(*arguments)[:, 1:]))
+    shorter = run(
+        "returns.lambda_return_literals", module(lambda_return=lambda *arguments: lambda_return(*arguments)[:, 1:])
+    )
     assert shorter.message == "lambda_return: expected shape (1, 3), got (1, 2)"
 
 
@@ -240,9 +263,13 @@ def test_what_is_not_implemented_is_not_offered() -> None:
     for profile, statuses in (("official", ["pass", "not offered"]), ("paper", ["not offered", "not offered"])):
         results = [run_check(CHECKS[f"networks.{name}"], PoolsOnly(), "float64", profile) for name in names]
         assert [result.status for result in results] == statuses
-        assert {result.message for result in results if result.message} == {"not implemented: encoder (strided convolutions)"}
+        assert {result.message for result in results if result.message} == {
+            "not implemented: encoder (strided convolutions)"
+        }
     rest = [check for name, check in CHECKS.items() if name.startswith("networks.") and "encoder" in check.uses]
-    found = {check.name for check in rest if run_check(check, PoolsOnly(), "float64", "official").status == "not offered"}
+    found = {
+        check.name for check in rest if run_check(check, PoolsOnly(), "float64", "official").status == "not offered"
+    }
     assert found == {"networks.brightness_literals", "networks.encoder_with_other_convolutions_matches"}
 
 
@@ -276,7 +303,10 @@ def test_an_adapter_that_is_not_there(tmp_path: Path) -> None:
 
 def test_an_adapter_with_a_dataclass(tmp_path: Path) -> None:
     """Annotations as text are looked up in the module, by its name."""
-    source = "from __future__ import annotations\nimport dataclasses\n\n\n@dataclasses.dataclass\nclass Losses:\n    dynamics: float\n"
+    source = (
+        "from __future__ import annotations\nimport "
+        "dataclasses\n\n\n@dataclasses.dataclass\nclass Losses:\n    dynamics: float\n"
+    )
     (tmp_path / "with_a_dataclass.py").write_text(source, encoding="utf-8")
     assert load_file(tmp_path / "with_a_dataclass.py").Losses(1.0).dynamics == 1
 
@@ -295,7 +325,8 @@ def test_an_adapter_does_not_end_the_kit(tmp_path: Path) -> None:
         candidate.load_candidate(str(tmp_path / "script.py"), "float64")
 
 
-# --- A stranger --------------------------------------------------------------------------------------------------------------------------
+# --- A stranger
+# ------------------------------------------------------------------------------
 
 STRANGER = TESTS / "stranger_adapter.py"
 PASSES = (
@@ -322,14 +353,17 @@ def test_a_mistake_of_the_stranger_is_found() -> None:
     assert run("returns.lambda_return_matches", ModuleAdapter(stranger, "float64")).status == "fail"
 
 
-# --- The document -------------------------------------------------------------------------------------------------------
+# --- The document
+# ------------------------------------------------------------------------------
 
 
 def blocks(language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", DOCUMENT, re.DOTALL)
 
 
-def mean_kl_losses(posterior: torch.Tensor, prior: torch.Tensor, free_nats: float, unimix: float) -> tuple[torch.Tensor, torch.Tensor]:
+def mean_kl_losses(
+    posterior: torch.Tensor, prior: torch.Tensor, free_nats: float, unimix: float
+) -> tuple[torch.Tensor, torch.Tensor]:
     config = dataclasses.replace(CONFIG, free_nats=free_nats, latent_unimix=unimix)
     return tuple(loss.mean() for loss in world_model.kl_losses(posterior, prior, config))
 
@@ -369,14 +403,19 @@ def test_the_messages_of_the_document_are_valid() -> None:
         jsonschema.Draft202012Validator({"$ref": f"#/$defs/{kind}", "$defs": schema["$defs"]}).validate(message)
 
 
-# --- Given samples -----------------------------------------------------------------------------------------------------------------------
+# --- Given samples
+# ------------------------------------------------------------------------------
 
 
 class Given(WithoutNoise, TorchAdapter):
     """The PyTorch backend with given samples."""
 
-    def gradients_given(self, params: Any, slow_critic: Any, return_range: Any, batch: Any, samples: Any, *rest: Any) -> Any:
-        return self.gradients(params, slow_critic, return_range, batch, self.noise_of(params, batch, samples, *rest), *rest)
+    def gradients_given(
+        self, params: Any, slow_critic: Any, return_range: Any, batch: Any, samples: Any, *rest: Any
+    ) -> Any:
+        return self.gradients(
+            params, slow_critic, return_range, batch, self.noise_of(params, batch, samples, *rest), *rest
+        )
 
     def train_step_given(self, state: Any, batch: Any, samples: Any, *rest: Any) -> Any:
         return self.train_step(state, batch, self.noise_of(state["params"], batch, samples, *rest), *rest)

@@ -53,7 +53,10 @@ def reference(edition: str) -> object:
 
 
 def statuses(adapter: object, edition: str, checks: list[Check] = TELLING) -> dict[str, str]:
-    return {check.name: judge(check, adapter, editions()[edition], "float64", 0, EXAMPLES, shrink=False).status for check in checks}
+    return {
+        check.name: judge(check, adapter, editions()[edition], "float64", 0, EXAMPLES, shrink=False).status
+        for check in checks
+    }
 
 
 class Stubborn:
@@ -67,7 +70,9 @@ class Stubborn:
         function = getattr(self._reference, name)
 
         def call(*arguments: Any) -> Any:
-            return function(*(self._mine(argument) if isinstance(argument, Config) else argument for argument in arguments))
+            return function(
+                *(self._mine(argument) if isinstance(argument, Config) else argument for argument in arguments)
+            )
 
         return call
 
@@ -77,7 +82,8 @@ class Stubborn:
         return type(config)(**{**vars(config), **{name: own[name] for name in settings}})
 
 
-# --- The data ----------------------------------------------------------------------------------------------------------------------------
+# --- The data
+# ------------------------------------------------------------------------------
 
 
 def test_the_data_are_sound() -> None:
@@ -101,7 +107,9 @@ def test_every_value_of_a_profile_belongs_to_a_requirement() -> None:
         told = [name for difference in edition.differs.values() for name in difference.settings]
         assert sorted(told) == sorted(profiles()[edition.profile])
         for name, value in profiles()[edition.profile].items():
-            assert value != hyperparameters()[name]["value"], f"{edition.name} sets {name} to the value that it has anyway"
+            assert value != hyperparameters()[name]["value"], (
+                f"{edition.name} sets {name} to the value that it has anyway"
+            )
 
 
 def test_names() -> None:
@@ -118,8 +126,15 @@ def test_the_mutants_of_an_edition_go_together_and_are_seen(name: str) -> None:
     assert mutant is not None
     assert set(mutant.replacements) == {target for like in editions()[name].mutants for target in MUTANTS[like].edits}
     for requirement in mutant.violates:
-        checks = [check for check in CHECKS.values() if requirement in check.requirements and "loss_derivatives" not in check.uses]
-        found = (run_check(check, MutantAdapter(mutant), "float64", editions()[name].profile, examples=5, shrink=False) for check in checks)
+        checks = [
+            check
+            for check in CHECKS.values()
+            if requirement in check.requirements and "loss_derivatives" not in check.uses
+        ]
+        found = (
+            run_check(check, MutantAdapter(mutant), "float64", editions()[name].profile, examples=5, shrink=False)
+            for check in checks
+        )
         assert any(result.status in ("fail", "error") for result in found), requirement
 
 
@@ -134,13 +149,17 @@ def test_every_chapter_that_editions_leave_says_so() -> None:
     assert "| BEH-2 | holds | holds | The actor has no uniform mixture. `actor_unimix` 0.0 | holds |" in text
 
 
-# --- Judging -----------------------------------------------------------------------------------------------------------------------------
+# --- Judging
+# ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("checks", [TELLING, pytest.param([*CHECKS.values()], marks=pytest.mark.slow)], ids=["some", "all"])
+@pytest.mark.parametrize(
+    "checks", [TELLING, pytest.param([*CHECKS.values()], marks=pytest.mark.slow)], ids=["some", "all"]
+)
 @pytest.mark.parametrize("name", PREFERRED)
 def test_each_reference_passes_in_its_own_edition_alone(name: str, checks: list[Check]) -> None:
-    """But for those of paper and 2024-12, which take their differences from the configuration, so that both pass in both."""
+    """But for those of paper and 2024-12, which take their differences from the configuration, so that both pass in
+    both."""
     for other in PREFERRED:
         found = statuses(reference(name), other, checks)
         failing = [check for check, status in found.items() if status in FAILING]
@@ -149,10 +168,16 @@ def test_each_reference_passes_in_its_own_edition_alone(name: str, checks: list[
 
 
 def test_results_are_compared_with_those_of_the_edition() -> None:
-    """The first version's two-hot fails in the paper's edition and passes in its own; the right one the other way round."""
+    """The first version's two-hot fails in the paper's edition and passes in its own; the right one the other way
+    round."""
     check = CHECKS["transforms.twohot_matches"]
     first, right = reference("2023"), NumpyAdapter()
-    for adapter, edition, status in ((first, "2023", "pass"), (first, "paper", "fail"), (right, "2023", "fail"), (right, "paper", "pass")):
+    for adapter, edition, status in (
+        (first, "2023", "pass"),
+        (first, "paper", "fail"),
+        (right, "2023", "fail"),
+        (right, "paper", "pass"),
+    ):
         result = judge(check, adapter, editions()[edition], "float64", 0, 5, shrink=False)
         assert result.status == status, (edition, result.message)
     wrong = judge(check, right, editions()["2023"], "float64", 0, 5, shrink=False)
@@ -206,7 +231,8 @@ def test_gradients_are_judged_where_the_losses_are_those_of_the_edition() -> Non
     assert judge(check, broken, editions()["2023"], "float64", 0, EXAMPLES).status == NOT_JUDGED
 
 
-# --- The best fit ------------------------------------------------------------------------------------------------------------------------
+# --- The best fit
+# ------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -230,7 +256,10 @@ def test_no_edition_wins_by_what_it_leaves_open() -> None:
     fits = [Fit("paper", {"a": "fail", "b": "pass"}), Fit("2023", {"a": NOT_JUDGED, "b": "pass"})]
     assert best(fits).edition == "paper"
     assert alike(fits, fits[0]) == ["2023"]
-    fits = [Fit("paper", {"a": "pass", "b": "pass", "c": "fail"}), Fit("2023", {"a": NOT_JUDGED, "b": "pass", "c": "pass"})]
+    fits = [
+        Fit("paper", {"a": "pass", "b": "pass", "c": "fail"}),
+        Fit("2023", {"a": NOT_JUDGED, "b": "pass", "c": "pass"}),
+    ]
     assert best(fits).edition == "2023"
     assert fits_better(fits[1], fits[0])
     assert not fits_better(fits[0], fits[0])
@@ -252,11 +281,14 @@ def test_what_is_not_implemented_speaks_neither_for_nor_against_an_edition() -> 
     def twohot(x: np.ndarray, bins: np.ndarray) -> np.ndarray:
         raise NotImplementedError("soft targets")
 
-    fits = fit([CHECKS["transforms.twohot_literals"]], types.SimpleNamespace(twohot=twohot, refuses_anyhow=True), "float64")
+    fits = fit(
+        [CHECKS["transforms.twohot_literals"]], types.SimpleNamespace(twohot=twohot, refuses_anyhow=True), "float64"
+    )
     assert [dict(one.statuses) for one in fits] == [{"transforms.twohot_literals": NOT_JUDGED}] * 4
 
 
-# --- The command -------------------------------------------------------------------------------------------------------------------------
+# --- The command
+# ------------------------------------------------------------------------------
 
 FIRST = """
 import numpy as np
@@ -282,14 +314,28 @@ def twohot(x, bins):
 
 def report(tmp_path: Path, edition: str | None, *options: str) -> tuple[int, dict[str, Any]]:
     (tmp_path / "mine.py").write_text(FIRST.format(edition=edition), encoding="utf-8")
-    code = main(["check", str(tmp_path / "mine.py"), "--only", "twohot_l", "--examples", "2", "--json", str(tmp_path / "r.json"), *options])
+    code = main(
+        [
+            "check",
+            str(tmp_path / "mine.py"),
+            "--only",
+            "twohot_l",
+            "--examples",
+            "2",
+            "--json",
+            str(tmp_path / "r.json"),
+            *options,
+        ]
+    )
     return code, json.loads((tmp_path / "r.json").read_text(encoding="utf-8")) if code < 2 else {}
 
 
 def test_the_edition_of_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     code, data = report(tmp_path, None)
     assert (code, data["edition"], data["profile"], data["choice"]) == (0, "2023", "2023", "best fit")
-    counts = {entry["edition"]: (entry["passed"], entry["judged"], entry["offered"]) for entry in data["fit"]["editions"]}
+    counts = {
+        entry["edition"]: (entry["passed"], entry["judged"], entry["offered"]) for entry in data["fit"]["editions"]
+    }
     assert counts == {"paper": (0, 1, 1), "2024-12": (0, 1, 1), "2024-04": (0, 1, 1), "2023": (1, 1, 1)}
     assert (data["fit"]["alike"], data["fit"]["better"]) == ([], None)
     assert "Judged as the edition 2023 (the first version), which fits best." in capsys.readouterr().out
@@ -313,13 +359,18 @@ def test_the_edition_of_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]
 
 def test_an_unknown_edition_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert report(tmp_path, "2020")[0] == 2
-    assert "the adapter's edition(): unknown edition '2020'; known: 2023, 2024-04, 2024-12, paper" in capsys.readouterr().err
+    assert (
+        "the adapter's edition(): unknown edition '2020'; known: 2023, 2024-04, 2024-12, paper"
+        in capsys.readouterr().err
+    )
     with pytest.raises(SystemExit):
         report(tmp_path, None, "--edition", "2020")
 
 
 def test_what_is_not_judged_does_not_pass(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "mine.py").write_text("def core(params, deter, stoch, action, config):\n    return deter\n", encoding="utf-8")
+    (tmp_path / "mine.py").write_text(
+        "def core(params, deter, stoch, action, config):\n    return deter\n", encoding="utf-8"
+    )
     run = ["check", str(tmp_path / "mine.py"), "--only", "rssm.core_matches", "--examples", "2"]
     assert main([*run, "--edition", "2023"]) == 1
     assert "1 checks, 0 numbers compared: 1 not in edition" in capsys.readouterr().out
@@ -331,5 +382,9 @@ def test_returns_are_the_same_in_all_editions() -> None:
     right = types.SimpleNamespace(lambda_return=returns.lambda_return)
     wrong = MutantAdapter(MUTANTS["return_bootstraps_from_itself"])
     for edition in editions():
-        assert statuses(right, edition, [CHECKS["returns.lambda_return_matches"]]) == {"returns.lambda_return_matches": "pass"}
-        assert statuses(wrong, edition, [CHECKS["returns.lambda_return_matches"]]) == {"returns.lambda_return_matches": "fail"}
+        assert statuses(right, edition, [CHECKS["returns.lambda_return_matches"]]) == {
+            "returns.lambda_return_matches": "pass"
+        }
+        assert statuses(wrong, edition, [CHECKS["returns.lambda_return_matches"]]) == {
+            "returns.lambda_return_matches": "fail"
+        }

@@ -62,7 +62,9 @@ def test_two_deviations_are_a_deviation() -> None:
         right = np.sign(x) * np.log1p(np.abs(x))
         return right[..., None] if np.ndim(x) > 1 else right + 1
 
-    result = run_check(CHECKS["transforms.symlog_matches"], adapter(symlog=two_mistakes), "float64", "paper", examples=200)
+    result = run_check(
+        CHECKS["transforms.symlog_matches"], adapter(symlog=two_mistakes), "float64", "paper", examples=200
+    )
     assert result.status == "fail", result.message
 
 
@@ -77,7 +79,9 @@ def test_a_device_that_is_not_there(capsys: pytest.CaptureFixture[str]) -> None:
 def test_a_candidate_is_a_column_a_module_or_a_file(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "helper.py").write_text("import numpy as np\n\n\ndef right(x):\n    return np.sign(x) * np.log1p(np.abs(x))\n")
+    (tmp_path / "helper.py").write_text(
+        "import numpy as np\n\n\ndef right(x):\n    return np.sign(x) * np.log1p(np.abs(x))\n"
+    )
     (tmp_path / "mine.py").write_text("from helper import right\n\n\ndef symlog(x):\n    return right(x)\n")
     only = ["--only", "symlog_matches"]
     assert main(["check", str(tmp_path / "mine.py"), *only]) == 0

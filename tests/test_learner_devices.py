@@ -4,8 +4,8 @@ import jax
 import pytest
 
 from conformance.problems import small_config, spaces
+from dreamer_spec.backend import Learner, learner_class
 from impl_jax.learner import select_device as jax_device
-from train.backend import Learner, learner_class
 
 TASK = spaces("vector", "mixed")
 
@@ -22,7 +22,11 @@ def test_unknown_devices_are_named(backend: str, device: str) -> None:
 
 
 def test_jax_counts_devices(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(jax, "devices", lambda kind=None: {"cpu": ["the processor"], "cuda": ["one", "two"], "gpu": ["one", "two"]}[kind])
+    monkeypatch.setattr(
+        jax,
+        "devices",
+        lambda kind=None: {"cpu": ["the processor"], "cuda": ["one", "two"], "gpu": ["one", "two"]}[kind],
+    )
     names = ("cpu", "gpu", "cuda", "cuda:0", "cuda:1", "gpu:1")
     assert [jax_device(name) for name in names] == ["the processor", "one", "one", "one", "two", "two"]
     for name in ("cuda:2", "gpu:10"):

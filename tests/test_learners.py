@@ -8,10 +8,10 @@ import pytest
 from safetensors.numpy import load, load_file, save
 
 from conformance.problems import random_batch, random_observations, random_state, small_config, spaces
+from dreamer_spec import checkpoint
+from dreamer_spec.backend import Learner, learner_class
 from reference_numpy import agent as reference
 from spec import Config, Discrete, Spaces, parameter_table
-from train import checkpoint
-from train.backend import Learner, learner_class
 
 pytestmark = pytest.mark.usefixtures("compile_once")
 
@@ -78,7 +78,9 @@ def train(learner: Learner, first: int, steps: int) -> list[np.ndarray]:
     results = []
     for step in range(first, first + steps):
         metrics, latents = learner.train_step(batch(step), step)
-        results += [np.array(float(metrics[name])) for name in sorted(metrics)] + [np.array(latents[name]) for name in ("deter", "stoch")]
+        results += [np.array(float(metrics[name])) for name in sorted(metrics)] + [
+            np.array(latents[name]) for name in ("deter", "stoch")
+        ]
     return results
 
 
@@ -97,14 +99,18 @@ def assert_same_state(a: Mapping[str, np.ndarray], b: Mapping[str, np.ndarray]) 
 @pytest.mark.covers("AGT-1", "AGT-8", "AGT-9", "CON-22", "CON-29", "CON-30")
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
 @pytest.mark.parametrize("profile", ["paper", "official"])
-@pytest.mark.parametrize(("observations", "actions"), [("vector", "discrete"), ("image", "continuous"), ("both", "mixed")])
+@pytest.mark.parametrize(
+    ("observations", "actions"), [("vector", "discrete"), ("image", "continuous"), ("both", "mixed")]
+)
 def test_the_state_has_the_names_shapes_and_types_of_the_chapter(
     backend: str, observations: str, actions: str, profile: str, dtype: str
 ) -> None:
     task, config = spaces(observations, actions), small_config(profile, dtype)
     table = parameter_table(config, task)
     expected = {f"{group}/{name}": (entry.shape, "float32") for group in STATE_GROUPS for name, entry in table.items()}
-    expected |= {f"slow_critic/{name}": (entry.shape, "float32") for name, entry in table.items() if name.startswith("critic/")}
+    expected |= {
+        f"slow_critic/{name}": (entry.shape, "float32") for name, entry in table.items() if name.startswith("critic/")
+    }
     expected |= {f"return_range/{end}": ((), "float32") for end in ("low", "high")}
     expected |= {"optimizer/step": ((), "int64")}
     state = make(backend, 0, task, config).state_dict()
@@ -172,11 +178,24 @@ def test_a_state_is_a_copy(learner: Learner) -> None:
 def test_states_that_do_not_fit_are_refused_and_change_nothing(learner: Learner) -> None:
     learner.load_state_dict(middle_of_training())
     state = learner.state_dict()
-    wrong = {**state, "params/rssm/gru/bias": np.zeros(7, np.float32), "optimizer/step": np.zeros(1, np.int64), "params/extra": np.zeros(1)}
+    wrong = {
+        **state,
+        "params/rssm/gru/bias": np.zeros(7, np.float32),
+        "optimizer/step": np.zeros(1, np.int64),
+        "params/extra": np.zeros(1),
+    }
     del wrong["slow_critic/critic/out/bias"]
     with pytest.raises(ValueError) as error:  # noqa: PT011 - the words are below
         learner.load_state_dict(wrong)
-    for words in ("params/rssm/gru/bias", "[7]", "[48]", "optimizer/step", "[1]", "params/extra", "slow_critic/critic/out/bias"):
+    for words in (
+        "params/rssm/gru/bias",
+        "[7]",
+        "[48]",
+        "optimizer/step",
+        "[1]",
+        "params/extra",
+        "slow_critic/critic/out/bias",
+    ):
         assert words in str(error.value), words
     assert "params/rssm/gru/kernel" not in str(error.value)
     assert_same_state(learner.state_dict(), state)
@@ -236,21 +255,31 @@ def test_every_seed_gives_noise_of_its_own(learner: Learner, fresh: Arrays, step
         samples.append(np.array(latents["stoch"]))
     assert np.array_equal(samples[0], samples[3])
     for i, j in ((0, 1), (1, 2), (0, 2)):
-        assert np.mean(samples[i] != samples[j]) > 0.5, "nearly uniform samples of 5 classes must differ in 4 of 5 places"
+        assert np.mean(samples[i] != samples[j]) > 0.5, (
+            "nearly uniform samples of 5 classes must differ in 4 of 5 places"
+        )
 
 
 @pytest.mark.covers("CON-21")
 def test_the_numbers_of_one_step_are_independent(learner: Learner, fresh: Arrays) -> None:
     """Rows, steps, latents and action dimensions do not share random numbers; means are those of the distributions."""
     outputs = ("params/rssm/posterior/out/kernel", "params/actor/out/")
-    learner.load_state_dict({name: np.zeros_like(array) if name.startswith(outputs) else array for name, array in fresh.items()})
+    learner.load_state_dict(
+        {name: np.zeros_like(array) if name.startswith(outputs) else array for name, array in fresh.items()}
+    )
     envs = 512
     one = {key: np.repeat(value[:1], envs, 0) for key, value in observation(0).items()}
     action, latents, _ = learner.policy(one, np.ones(envs, bool), learner.initial_carry(envs), 0)
     arm, buttons, stoch = action[:, :2], action[:, 2:], np.asarray(latents["stoch"])
     # With outputs of 0 every class is equally likely, and the normals have mean 0 and this standard deviation.
     std = CONFIG.actor_min_std + (CONFIG.actor_max_std - CONFIG.actor_min_std) / (1 + np.exp(-2))
-    columns = [arm[:, 0] / std, arm[:, 1] / std, *(stoch - 2).T / 2**0.5, 2 * buttons[:, 0] - 1, (buttons[:, 2] - 1 / 3) / (2 / 9) ** 0.5]
+    columns = [
+        arm[:, 0] / std,
+        arm[:, 1] / std,
+        *(stoch - 2).T / 2**0.5,
+        2 * buttons[:, 0] - 1,
+        (buttons[:, 2] - 1 / 3) / (2 / 9) ** 0.5,
+    ]
     correlation = np.array(columns) @ np.array(columns).T / envs
     assert np.abs(correlation - np.eye(len(columns))).max() < 6 / envs**0.5
     assert np.abs(np.mean(columns, axis=1)).max() < 5 / envs**0.5
@@ -266,10 +295,15 @@ def test_the_numbers_of_one_step_are_independent(learner: Learner, fresh: Arrays
 
 
 def decided(config: Config, task: Spaces) -> Arrays:
-    """A state whose every categorical is certain: samples do not depend on the noise, so that backends can be compared."""
+    """A state whose every categorical is certain: samples do not depend on the noise, so that backends can be
+    compared."""
     state, rng = middle_of_training(config, task), np.random.default_rng(6)
     classes = {f"rssm/{part}/out": [config.classes] * config.stoch for part in ("posterior", "prior")}
-    classes |= {f"actor/out/{key}/logits": list(space.classes) for key, space in task.actions.items() if isinstance(space, Discrete)}
+    classes |= {
+        f"actor/out/{key}/logits": list(space.classes)
+        for key, space in task.actions.items()
+        if isinstance(space, Discrete)
+    }
     for name, sizes in classes.items():
         state[f"params/{name}/kernel"][...] = 0
         state[f"params/{name}/bias"][...] = np.concatenate([60 * np.eye(size)[rng.integers(size)] for size in sizes])
@@ -287,7 +321,8 @@ def decided_learner(backend: str) -> Learner:
 
 @pytest.mark.covers("AGT-10", "AGT-29", "AGT-30")
 def test_a_state_of_one_backend_goes_on_in_the_other() -> None:
-    """The other takes over every number. Where samples are certain, the next steps agree, and their losses with the reference."""
+    """The other takes over every number. Where samples are certain, the next steps agree, and their losses with the
+    reference."""
     task, config = DECIDED_TASK, DECIDED_CONFIG
     one, other = (make(backend, seed, task, config) for seed, backend in enumerate(BACKENDS))
     one.load_state_dict(decided(config, task))
@@ -302,11 +337,15 @@ def test_a_state_of_one_backend_goes_on_in_the_other() -> None:
         np.testing.assert_allclose(latents["deter"], other_latents["deter"], atol=1e-5)
         assert set(metrics) == set(other_metrics)
         for name in metrics:
-            np.testing.assert_allclose(float(metrics[name]), float(other_metrics[name]), rtol=2e-4, atol=2e-5, err_msg=name)
+            np.testing.assert_allclose(
+                float(metrics[name]), float(other_metrics[name]), rtol=2e-4, atol=2e-5, err_msg=name
+            )
         after, other_after = first.state_dict(), second.state_dict()
         assert set(after) == set(other_after)
         for name, value in after.items():
-            np.testing.assert_allclose(value, other_after[name], rtol=1e-3, atol=1e-3 * np.abs(value).max() + 1e-7, err_msg=name)
+            np.testing.assert_allclose(
+                value, other_after[name], rtol=1e-3, atol=1e-3 * np.abs(value).max() + 1e-7, err_msg=name
+            )
         before = reference.unflatten_state(state, parameter_table(config, task))
         noise = {
             "posterior": np.full((2, 5, 3), 0.3),

@@ -1,4 +1,5 @@
-"""Train steps side by side: honest backends stay together, planted mistakes are named with their first step and tensor."""
+"""Train steps side by side: honest backends stay together, planted mistakes are named with their first step and
+tensor."""
 
 import dataclasses
 import json
@@ -39,7 +40,9 @@ def torch_backend() -> Any:
 @pytest.fixture(scope="module")
 def together() -> Lockstep:
     """All three backends on the smallest problem; the reference has PyTorch's gradients, which need not be compiled."""
-    lockstep = Lockstep({name: load_candidate(name, "float64") for name in ("torch", "jax", "numpy")}, "vector", "paper", "float64", 0)
+    lockstep = Lockstep(
+        {name: load_candidate(name, "float64") for name in ("torch", "jax", "numpy")}, "vector", "paper", "float64", 0
+    )
     for _ in range(STEPS):
         lockstep.step()
     return lockstep
@@ -92,11 +95,14 @@ def test_the_steps_do_something(together: Lockstep) -> None:
             assert still == [], name
     assert not np.array_equal(states["jax"]["params"]["rssm/gru/kernel"], states["torch"]["params"]["rssm/gru/kernel"])
     slow = states["numpy"]["slow_critic"]["critic/out/kernel"]
-    assert np.linalg.norm(slow) < 0.5 * np.linalg.norm(states["numpy"]["params"]["critic/out/kernel"]), "the slow critic is behind"
+    assert np.linalg.norm(slow) < 0.5 * np.linalg.norm(states["numpy"]["params"]["critic/out/kernel"]), (
+        "the slow critic is behind"
+    )
 
 
 def test_precisions_below_float64_are_shown_and_not_judged() -> None:
-    """The same backend in float32 and in float64: a float32 is some 1e-7, and an update only a small part of a number."""
+    """The same backend in float32 and in float64: a float32 is some 1e-7, and an update only a small part of a
+    number."""
     members = {"single": load_candidate("torch", "float32"), "double": load_candidate("torch", "float64")}
     lockstep = Lockstep(members, "vector", "paper", "float32", 0)
     assert exceeded(lockstep, 3) == []
@@ -111,7 +117,8 @@ def test_precisions_below_float64_are_shown_and_not_judged() -> None:
 @pytest.mark.parametrize("backend", ["jax", "torch"])
 @pytest.mark.parametrize("rows", [1, 7, 32, 160])
 def test_mirrored_logits_have_mean_zero(backend: str, rows: int) -> None:
-    """Compiled, too. Probabilities of mirrored logits that differ in the last bit once made a third of a gradient noise."""
+    """Compiled, too. Probabilities of mirrored logits that differ in the last bit once made a third of a gradient
+    noise."""
     half = np.random.default_rng(0).normal(size=(rows, 127))
     logits = np.concatenate([half, np.zeros((rows, 1)), half[:, ::-1]], -1).astype(np.float32)
     bins = exponential_bins(255)
@@ -128,7 +135,11 @@ def test_mirrored_logits_have_mean_zero(backend: str, rows: int) -> None:
 SLIGHT = dataclasses.replace(
     MUTANTS["slow_critic_decay_swapped"],
     name="slight",
-    edits={"behavior.update_slow_critic": {"decay * old + (1 - decay) * new": "(decay + 1e-4) * old + (1 - decay - 1e-4) * new"}},
+    edits={
+        "behavior.update_slow_critic": {
+            "decay * old + (1 - decay) * new": "(decay + 1e-4) * old + (1 - decay - 1e-4) * new"
+        }
+    },
 )
 
 
@@ -144,7 +155,9 @@ SLIGHT = dataclasses.replace(
     ],
     ids=lambda value: getattr(value, "name", None),
 )
-def test_a_mistake_of_the_reference_is_named(torch_backend: Any, mutant: Mutant, profile: str, step: int, tensor: str) -> None:
+def test_a_mistake_of_the_reference_is_named(
+    torch_backend: Any, mutant: Mutant, profile: str, step: int, tensor: str
+) -> None:
     """The reference's losses and optimizer are judged with given gradients."""
     lockstep = Lockstep({"torch": torch_backend, "mutant": MutantAdapter(mutant)}, "vector", profile, "float64", 0)
     found = exceeded(lockstep, step)
@@ -159,7 +172,11 @@ def test_a_mistake_that_begins_late_is_named_when_it_begins(torch_backend: Any) 
         return right(state, batch, noise, task, wrong if state["optimizer"]["step"] >= 3 else config)
 
     lockstep = Lockstep(
-        {"numpy": load_candidate("numpy", "float64"), "late": Wrapped(torch_backend, late)}, "vector", "paper", "float64", 0
+        {"numpy": load_candidate("numpy", "float64"), "late": Wrapped(torch_backend, late)},
+        "vector",
+        "paper",
+        "float64",
+        0,
     )
     assert [(mode, step) for mode, step, _ in exceeded(lockstep, 5)] == [("free", 4), ("one step", 4)]
 
@@ -169,7 +186,9 @@ def test_a_gradient_that_is_not_a_number_is_beyond_every_bound(torch_backend: An
         state, aux = right(*arguments)
         return {**state, "params": {**state["params"], "actor/hidden0/scale": np.full(16, np.nan)}}, aux
 
-    lockstep = Lockstep({"torch": torch_backend, "broken": Wrapped(torch_backend, broken)}, "vector", "paper", "float64", 0)
+    lockstep = Lockstep(
+        {"torch": torch_backend, "broken": Wrapped(torch_backend, broken)}, "vector", "paper", "float64", 0
+    )
     assert exceeded(lockstep, 1) == [(mode, 1, "params/actor/hidden0/scale") for mode in ("free", "one step")]
     assert report(lockstep)["comparisons"]["broken"]["free"]["exceeded"]["deviation"] is None
 
@@ -181,7 +200,9 @@ def test_samples_that_part_end_the_free_run(torch_backend: Any) -> None:
         state, aux = right(*arguments)
         return {**state, "params": {name: 1.5 * value for name, value in state["params"].items()}}, aux
 
-    lockstep = Lockstep({"torch": torch_backend, "drifting": Wrapped(torch_backend, drifting)}, "vector", "paper", "float64", 0)
+    lockstep = Lockstep(
+        {"torch": torch_backend, "drifting": Wrapped(torch_backend, drifting)}, "vector", "paper", "float64", 0
+    )
     exceeded(lockstep, 3)
     modes = lockstep.comparisons["drifting"]
     assert modes["free"].parted == 2
@@ -194,7 +215,9 @@ def test_noise_keeps_its_distance_from_the_thresholds(torch_backend: Any, monkey
     monkeypatch.setitem(run.MARGIN, "float64", 1e-4)
     lockstep = Lockstep({"torch": torch_backend, "same": torch_backend}, "vector", "paper", "float64", 0)
     batch = lockstep._stream.batch(0)
-    margins = [lockstep._samples(lockstep._start, batch, lockstep._noise(lockstep._start, batch)[0])[1] for _ in range(3)]
+    margins = [
+        lockstep._samples(lockstep._start, batch, lockstep._noise(lockstep._start, batch)[0])[1] for _ in range(3)
+    ]
     assert min(margins) >= 1e-4
     assert lockstep.redrawn > 0
     monkeypatch.setitem(run.MARGIN, "float64", 0.5)
@@ -273,7 +296,11 @@ def test_the_stream_holds_all_that_a_batch_can(observation: str, action: str) ->
     batches = [one.batch(8 * number) for number in range(60)]
     again = [other.batch(8 * number) for number in range(60)]
     assert all(np.array_equal(a[name], b[name]) for a, b in zip(batches, again, strict=True) for name in a)
-    flat = {name: np.concatenate([batch[name] for batch in batches], 1) for name in batches[0] if name not in ("deter", "stoch")}
+    flat = {
+        name: np.concatenate([batch[name] for batch in batches], 1)
+        for name in batches[0]
+        if name not in ("deter", "stoch")
+    }
     first, last, terminal = flat["is_first"], flat["is_last"], flat["is_terminal"]
     np.testing.assert_array_equal(first[:, 1:], last[:, :-1])
     assert first[:, 0].all()
@@ -302,7 +329,10 @@ def test_latents_are_the_context_of_the_next_batch() -> None:
 def test_every_group_has_tensors(together: Lockstep) -> None:
     state = together._states["numpy"]
     aux = {"stoch": np.zeros((4, 8, 6, 6)), "deter": np.zeros((4, 8, 32)), "losses": {"reward": 1.0}}
-    assert tuple(dict.fromkeys(tensor.group for tensor in deviations((state, aux), (state, aux), together._start))) == GROUPS
+    assert (
+        tuple(dict.fromkeys(tensor.group for tensor in deviations((state, aux), (state, aux), together._start)))
+        == GROUPS
+    )
 
 
 # The command

@@ -14,13 +14,13 @@ from train_agents import random_learner_state, save_checkpoint
 import impl_jax.behavior
 import impl_torch.behavior
 from conformance.problems import random_observations, small_config
+from dreamer_spec.backend import Learner, learner_class
+from dreamer_spec.checkpoint import open_checkpoint
+from dreamer_spec.cli import main
+from dreamer_spec.policy import Policy
+from dreamer_spec.saved_agent import agent_of
 from reference_numpy import behavior, networks
 from spec import Config, Discrete, Image, Spaces, Vector
-from train.backend import Learner, learner_class
-from train.checkpoint import open_checkpoint
-from train.cli import main
-from train.policy import Policy
-from train.saved_agent import agent_of
 
 TASK = Spaces(
     {"image": Image(16, 16, 3), "speed": Vector(2), "room": Discrete((3,))},
@@ -40,7 +40,11 @@ def outputs(seed: int = 0) -> dict[str, dict[str, np.ndarray]]:
 def mode_by(column: str, raw: dict[str, dict[str, np.ndarray]]) -> np.ndarray:
     convert = {"numpy": np.asarray, "jax": jnp.asarray, "torch": lambda x: torch.tensor(x, dtype=torch.float32)}[column]
     module: Any = {"numpy": behavior, "jax": impl_jax.behavior, "torch": impl_torch.behavior}[column]
-    return np.asarray(module.mode_action({key: {name: convert(x) for name, x in part.items()} for key, part in raw.items()}, TASK, CONFIG))
+    return np.asarray(
+        module.mode_action(
+            {key: {name: convert(x) for name, x in part.items()} for key, part in raw.items()}, TASK, CONFIG
+        )
+    )
 
 
 @pytest.mark.covers("LOOP-71")
@@ -85,14 +89,18 @@ def test_an_exported_policy_takes_the_mode_as_a_backend_does(tmp_path: Path) -> 
     size = TASK.action_noise_size
     action = policy(observation, first, noise | {"action": np.full((ROWS, size), 0.9)}, mode=True)
     policy.reset(ROWS)
-    np.testing.assert_array_equal(policy(observation, first, noise | {"action": np.zeros((ROWS, size))}, mode=True), action)
+    np.testing.assert_array_equal(
+        policy(observation, first, noise | {"action": np.zeros((ROWS, size))}, mode=True), action
+    )
     step: Any = importlib.import_module("impl_torch.agent").policy_step
     params = {name: torch.tensor(value) for name, value in saved.parameters.items()}
     carry = {"deter": torch.zeros(ROWS, CONFIG.deter), "stoch": torch.zeros(ROWS, CONFIG.stoch, CONFIG.classes)}
     inputs = {key: torch.tensor(value) for key, value in observation.items()}
     draws = {"posterior": torch.full((ROWS, CONFIG.stoch), 0.3), "action": torch.rand(ROWS, size)}
     before = torch.zeros(ROWS, TASK.action_size)
-    _, expected = step(params, carry, before, inputs, torch.ones(ROWS, dtype=torch.bool), draws, TASK, CONFIG, mode=True)
+    _, expected = step(
+        params, carry, before, inputs, torch.ones(ROWS, dtype=torch.bool), draws, TASK, CONFIG, mode=True
+    )
     np.testing.assert_allclose(action, expected.numpy(), rtol=1e-4, atol=1e-4)
 
 

@@ -22,7 +22,8 @@ Arrays = dict[str, np.ndarray]
 
 
 def problem() -> tuple[Arrays, list[Arrays]]:
-    """Parameters, and the gradients of some steps: of many sizes, so that some are clipped, and some entries are zero."""
+    """Parameters, and the gradients of some steps: of many sizes, so that some are clipped, and some entries are
+    zero."""
     rng = np.random.default_rng(0)
 
     def draw(name: str, size: float) -> np.ndarray:
@@ -93,7 +94,9 @@ CLIPPED = {  # parameter, gradient, clipped to 0.3 of the parameter's norm or of
 @pytest.mark.covers("OPT-1", "OPT-2", "OPT-3", "OPT-4")
 def test_clipping_in_torch() -> None:
     """Each tensor by itself, in place; what has no gradient is left alone."""
-    parameters = [torch.tensor(parameter, dtype=torch.float32, requires_grad=True) for parameter, _, _ in CLIPPED.values()]
+    parameters = [
+        torch.tensor(parameter, dtype=torch.float32, requires_grad=True) for parameter, _, _ in CLIPPED.values()
+    ]
     for parameter, (_, gradient, _) in zip(parameters, CLIPPED.values(), strict=True):
         parameter.grad = torch.tensor(gradient, dtype=torch.float32)
     torch_optimizer.clip_gradients_([*parameters, torch.ones(2, requires_grad=True)], 0.3)
@@ -103,7 +106,9 @@ def test_clipping_in_torch() -> None:
 
 @pytest.mark.covers("OPT-1", "OPT-2", "OPT-3", "OPT-4")
 def test_clipping_in_jax() -> None:
-    params, gradients, expected = ({name: jnp.array(case[part], jnp.float32) for name, case in CLIPPED.items()} for part in range(3))
+    params, gradients, expected = (
+        {name: jnp.array(case[part], jnp.float32) for name, case in CLIPPED.items()} for part in range(3)
+    )
     clipping = jax_optimizer.adaptive_gradient_clipping(0.3)
     clipped, _ = clipping.update(gradients, clipping.init(params), params)
     assert_close(clipped, expected)
@@ -120,7 +125,9 @@ def test_clipping_and_laprop_of_torch_are_the_optimizer_step() -> None:
     params, zeros = in_torch(arrays), {name: np.zeros_like(x) for name, x in arrays.items()}
     state = {"step": 0, "second_moment": in_torch(zeros), "momentum": in_torch(zeros)}
     module = torch.nn.ParameterDict(in_torch(arrays))
-    optimizer = torch_optimizer.LaProp(module.parameters(), CONFIG.learning_rate, (CONFIG.beta1, CONFIG.beta2), CONFIG.laprop_epsilon)
+    optimizer = torch_optimizer.LaProp(
+        module.parameters(), CONFIG.learning_rate, (CONFIG.beta1, CONFIG.beta2), CONFIG.laprop_epsilon
+    )
     warmup = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: min(1.0, step / CONFIG.warmup_steps))
     for gradients in steps:
         for name, parameter in module.items():
@@ -185,7 +192,9 @@ def test_jax_learns_a_line() -> None:
     x = jnp.linspace(-1, 1, 20)
     schedule = optax.piecewise_constant_schedule(0.03, {200: 0.1})
     optimizer = optax.chain(
-        jax_optimizer.adaptive_gradient_clipping(0.3), jax_optimizer.scale_by_laprop(), optax.scale_by_learning_rate(schedule)
+        jax_optimizer.adaptive_gradient_clipping(0.3),
+        jax_optimizer.scale_by_laprop(),
+        optax.scale_by_learning_rate(schedule),
     )
 
     def loss(params: list[tuple[jax.Array, jax.Array]]) -> jax.Array:
@@ -251,7 +260,10 @@ def test_betas_outside_of_the_unit_interval_are_refused(betas: tuple[float, floa
 def test_torch_walks_through_tensors_of_any_size_and_order() -> None:
     """Longer than a piece that it updates at a time, and not contiguous in memory."""
     generator = torch.Generator().manual_seed(0)
-    long, columns = torch.randn(torch_optimizer.CHUNK + 7, generator=generator), torch.randn(6, 4, generator=generator).t()
+    long, columns = (
+        torch.randn(torch_optimizer.CHUNK + 7, generator=generator),
+        torch.randn(6, 4, generator=generator).t(),
+    )
     for start in (long, columns):
         parameter = start.clone().requires_grad_()
         optimizer = torch_optimizer.LaProp([parameter], lr=0.5)
@@ -259,7 +271,9 @@ def test_torch_walks_through_tensors_of_any_size_and_order() -> None:
         for step in range(2):
             parameter.grad = torch.randn(start.shape, generator=generator)
             optimizer.step()
-            update, second_moment, momentum = torch_optimizer.laprop(parameter.grad, second_moment, momentum, step, CONFIG)
+            update, second_moment, momentum = torch_optimizer.laprop(
+                parameter.grad, second_moment, momentum, step, CONFIG
+            )
             expected = expected - 0.5 * update
         np.testing.assert_allclose(parameter.detach(), expected, rtol=1e-5, atol=1e-6)
 
@@ -269,17 +283,35 @@ def test_torch_walks_through_tensors_of_any_size_and_order() -> None:
 def test_torch_clips_a_flat_buffer_as_it_clips_each_tensor(dtype: torch.dtype) -> None:
     """Tensors of one row, of many, and of rows of rows, from huge to tiny, with zeros and infinity among them."""
     huge = 1e30 if dtype == torch.float32 else 1e200
-    sizes = {"scalar": 1, "row": 64, "more": 65, "huge": 5000, "tiny": 4097, "zero": 70, "many": 64**3 + 1, "infinite": 200}
-    layout, generator = Layout({name: (size,) if size > 1 else () for name, size in sizes.items()}), torch.Generator().manual_seed(0)
-    gradients, parameters = ([torch.randn(shape, generator=generator, dtype=dtype) for shape in layout.shapes.values()] for _ in range(2))
+    sizes = {
+        "scalar": 1,
+        "row": 64,
+        "more": 65,
+        "huge": 5000,
+        "tiny": 4097,
+        "zero": 70,
+        "many": 64**3 + 1,
+        "infinite": 200,
+    }
+    layout, generator = (
+        Layout({name: (size,) if size > 1 else () for name, size in sizes.items()}),
+        torch.Generator().manual_seed(0),
+    )
+    gradients, parameters = (
+        [torch.randn(shape, generator=generator, dtype=dtype) for shape in layout.shapes.values()] for _ in range(2)
+    )
     for index, name in enumerate(sizes):
         gradients[index] *= {"huge": huge, "tiny": 1 / huge, "zero": 0.0}.get(name, 1.0)
         if name == "infinite":
             gradients[index][100] = torch.inf
-    expected = [torch_optimizer.adaptive_gradient_clip(*pair, 0.3, 1e-3) for pair in zip(gradients, parameters, strict=True)]
+    expected = [
+        torch_optimizer.adaptive_gradient_clip(*pair, 0.3, 1e-3) for pair in zip(gradients, parameters, strict=True)
+    ]
     flat = layout.pack(gradients)
     norms, factors = torch_optimizer.clip_flat_gradients_(flat, layout.pack(parameters), layout, 0.3, 1e-3)
-    results = dict(zip(sizes, zip(layout.views(flat).values(), expected, norms, factors, gradients, strict=True), strict=True))
+    results = dict(
+        zip(sizes, zip(layout.views(flat).values(), expected, norms, factors, gradients, strict=True), strict=True)
+    )
     for name, (clipped, alone, norm, factor, gradient) in results.items():
         np.testing.assert_allclose(clipped, alone, rtol=1e-5, err_msg=name)
         if name == "infinite":

@@ -22,8 +22,8 @@ from reference_numpy import layers
 
 CHECKS = selected_checks("float64")
 NARROW_CHECKS = {check.name: check for check in selected_checks("bfloat16")}
-ROWS = ("transforms", "distributions", "layers", "rssm", "networks", "world_model", "returns", "behavior", "optimizer", "agent",
-        "replay", "training_loop")  # fmt: skip
+ROWS = ("transforms", "distributions", "layers", "rssm", "networks", "world_model", "returns", "behavior", "optimizer",
+        "agent", "replay", "training_loop")  # fmt: skip
 
 reach = functools.cache(lambda: sound(CHECKS)[0])
 
@@ -69,11 +69,21 @@ def test_the_reference_passes(check, profile: str) -> None:
 
 
 def silu_mutant(name: str, wrong: str) -> Mutant:
-    return Mutant(name, f"silu is {wrong}", "plausible", ("LAY-5",), "Use silu.", {"layers.silu": {"x / (1.0 + np.exp(-x))": wrong}})
+    return Mutant(
+        name,
+        f"silu is {wrong}",
+        "plausible",
+        ("LAY-5",),
+        "Use silu.",
+        {"layers.silu": {"x / (1.0 + np.exp(-x))": wrong}},
+    )
 
 
-def test_broken_checks_catch_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Deviations and what raises are counted apart, and a check that the reference does not pass is not counted at all."""
+def test_broken_checks_catch_nothing(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Deviations and what raises are counted apart, and a check that the reference does not pass is not counted at
+    all."""
 
     def deviates(run: Run) -> None:
         run.exact("silu", run.call("silu", np.zeros(1)), np.ones(1))
@@ -155,19 +165,28 @@ class NarrowGradients:
     def gradients(self, *arguments: Any) -> dict[str, np.ndarray]:
         gradients = self._right.gradients(*arguments)  # type: ignore[attr-defined]
         # The others get digits: this tests the check, and not the backend.
-        return {name: round_to(value, "bfloat16") * (1 if self._is_rounded(name) else 1 + 2.0**-12) for name, value in gradients.items()}
+        return {
+            name: round_to(value, "bfloat16") * (1 if self._is_rounded(name) else 1 + 2.0**-12)
+            for name, value in gradients.items()
+        }
 
 
-@pytest.mark.parametrize("name", ["encoder/image/conv1/bias", "decoder/image/out/bias", "rssm/gru/kernel", "actor/hidden0/scale"])
+@pytest.mark.parametrize(
+    "name", ["encoder/image/conv1/bias", "decoder/image/out/bias", "rssm/gru/kernel", "actor/hidden0/scale"]
+)
 def test_gradients_that_are_rounded_are_seen(name: str) -> None:
     check = "notation.what_must_be_float32_is_float32"
-    assert run_narrow(check, NarrowGradients(lambda parameter: "conv" in parameter and parameter.endswith("kernel")))[0] == "pass"
+    assert (
+        run_narrow(check, NarrowGradients(lambda parameter: "conv" in parameter and parameter.endswith("kernel")))[0]
+        == "pass"
+    )
     status, message = run_narrow(check, NarrowGradients(lambda parameter: parameter == name))
     assert (status, name in message) == ("fail", True), message
 
 
 def test_swapped_weights_of_the_kl_losses_are_seen(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Both losses have the same value, so that the total is right and only its gradient is wrong, which the reference cannot give."""
+    """Both losses have the same value, so that the total is right and only its gradient is wrong, which the reference
+    cannot give."""
     right, swapped = torch_agent.loss_scale, {"dynamics": "representation", "representation": "dynamics"}
     monkeypatch.setattr(torch_agent, "loss_scale", lambda name, config: right(swapped.get(name, name), config))
     checks = {check.name: check for check in CHECKS}

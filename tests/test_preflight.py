@@ -57,7 +57,15 @@ def test_it_tells_what_agrees_as_soon_as_it_does() -> None:
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 @pytest.mark.parametrize(
-    "start", ["critic/", "actor/hidden0/kernel", "rssm/gru/bias", "encoder/image/conv0/kernel", "reward/out/bias", "continue/hidden0/scale"]
+    "start",
+    [
+        "critic/",
+        "actor/hidden0/kernel",
+        "rssm/gru/bias",
+        "encoder/image/conv0/kernel",
+        "reward/out/bias",
+        "continue/hidden0/scale",
+    ],
 )
 def test_a_gradient_that_is_missing_is_seen(start: str, dtype: str) -> None:
     def without(gradients: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -72,7 +80,10 @@ def test_a_gradient_that_is_missing_is_seen(start: str, dtype: str) -> None:
 
 def test_a_gradient_that_is_not_finite_is_seen() -> None:
     def spoiled(gradients: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        return {name: np.full_like(value, np.nan) if name == "continue/out/bias" else value for name, value in gradients.items()}
+        return {
+            name: np.full_like(value, np.nan) if name == "continue/out/bias" else value
+            for name, value in gradients.items()
+        }
 
     assert not preflight_adapter(ChangedGradients("float64", spoiled), SPACES, config("float64")).passed
 

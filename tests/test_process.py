@@ -101,7 +101,11 @@ def test_configurations_and_spaces() -> None:
     """They are plain JSON, with what is derived from them, and become namespaces."""
     config, task = small_config("paper"), spaces("both", "mixed")
     got = decode(json.loads(json.dumps(encode_argument(config))))
-    assert (got.units, got.imagined_discount, got.feature_size) == (config.units, config.imagined_discount, config.feature_size)
+    assert (got.units, got.imagined_discount, got.feature_size) == (
+        config.units,
+        config.imagined_discount,
+        config.feature_size,
+    )
     assert got.cnn_multipliers == config.cnn_multipliers
     got = decode(json.loads(json.dumps(encode_argument(task))))
     assert list(got.observations) == list(task.observations)
@@ -163,7 +167,9 @@ def test_a_result_that_cannot_be_read(mode: str, message: str) -> None:
         assert adapter._connection is connection
 
 
-@pytest.mark.parametrize(("mode", "raised"), [("ValueError", ValueError), ("KeyError", KeyError), ("TypeError", CandidateError)])
+@pytest.mark.parametrize(
+    ("mode", "raised"), [("ValueError", ValueError), ("KeyError", KeyError), ("TypeError", CandidateError)]
+)
 def test_errors_of_the_other_side(mode: str, raised: type[Exception]) -> None:
     with fake(mode) as adapter, pytest.raises(raised, match="fake refuses x"):
         adapter.symlog(np.ones(2))
@@ -178,7 +184,10 @@ def test_a_long_error_is_cut(mode: str, raised: type[Exception]) -> None:
 
 
 def test_a_kind_that_is_no_text_loses_the_process() -> None:
-    with fake("a list as kind") as adapter, pytest.raises(CandidateLost, match="an error with kind and message as text"):
+    with (
+        fake("a list as kind") as adapter,
+        pytest.raises(CandidateLost, match="an error with kind and message as text"),
+    ):
         adapter.symlog(np.ones(2))
 
 
@@ -244,7 +253,9 @@ def test_ctrl_c_while_waiting_for_the_end_ends_the_process(monkeypatch: pytest.M
     assert running.process.poll() is not None
 
 
-@pytest.mark.parametrize(("mode", "message"), [("odd edition", "expected a name or nothing, got 3"), ("refuses edition", "fake refuses x")])
+@pytest.mark.parametrize(
+    ("mode", "message"), [("odd edition", "expected a name or nothing, got 3"), ("refuses edition", "fake refuses x")]
+)
 def test_an_edition_that_is_none(mode: str, message: str) -> None:
     with fake(mode) as adapter, pytest.raises(UserError, match=f"^edition: .*{message}"):
         adapter.edition()
@@ -255,7 +266,10 @@ def test_an_edition_that_is_none(mode: str, message: str) -> None:
     [
         (command("dies at once"), "ended with exit code 1 | its standard error ended with: | no such licence"),
         (command("old protocol"), "it speaks protocol 0, and the kit 1"),
-        (command("a million functions"), "expected at most 5,000 functions with names of at most 200 characters, got 1,000,000"),
+        (
+            command("a million functions"),
+            "expected at most 5,000 functions with names of at most 200 characters, got 1,000,000",
+        ),
         (command("long name"), "expected the name as text of at most 200 characters"),
         (command("reads nothing"), "no reply within 0.5 s"),
         (command("refuses start"), "the process was lost at start: refuses start: fake refuses x"),
@@ -326,7 +340,9 @@ def server(tmp_path: Path) -> Iterator[ProcessAdapter]:
     """The server as it is used where this project is not: one copied file, no packages of ours on the path."""
     shutil.copy(ROOT / "conformance" / "serve.py", tmp_path / "serve.py")
     (tmp_path / "mine.py").write_text(ADAPTER, encoding="utf-8")
-    adapter = ProcessAdapter(shlex.join([sys.executable, "-I", str(tmp_path / "serve.py"), str(tmp_path / "mine.py")]), "float64", 60.0)
+    adapter = ProcessAdapter(
+        shlex.join([sys.executable, "-I", str(tmp_path / "serve.py"), str(tmp_path / "mine.py")]), "float64", 60.0
+    )
     yield adapter
     adapter.close()
 
@@ -336,15 +352,21 @@ def test_neighbours_of_the_server_hide_no_standard_module(tmp_path: Path) -> Non
     there.mkdir()
     shutil.copy(ROOT / "conformance" / "serve.py", there / "serve.py")
     (there / "statistics.py").write_text("mean = None", encoding="utf-8")
-    (tmp_path / "mine.py").write_text("import statistics\n\n\ndef symlog(x):\n    return statistics.mean([1, 2, 6]) * x", encoding="utf-8")
-    adapter = ProcessAdapter(shlex.join([sys.executable, str(there / "serve.py"), str(tmp_path / "mine.py")]), "float64", 60.0)
+    (tmp_path / "mine.py").write_text(
+        "import statistics\n\n\ndef symlog(x):\n    return statistics.mean([1, 2, 6]) * x", encoding="utf-8"
+    )
+    adapter = ProcessAdapter(
+        shlex.join([sys.executable, str(there / "serve.py"), str(tmp_path / "mine.py")]), "float64", 60.0
+    )
     assert adapter.symlog(np.ones(2)).tolist() == [3.0, 3.0]
     adapter.close()
 
 
 def test_a_missing_parameter_is_named(tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text("def symlog(x):\n    return {}['reward/out/bias']", encoding="utf-8")
-    adapter = ProcessAdapter(shlex.join([sys.executable, "-m", "conformance.serve", str(tmp_path / "mine.py")]), "float64", 60.0)
+    adapter = ProcessAdapter(
+        shlex.join([sys.executable, "-m", "conformance.serve", str(tmp_path / "mine.py")]), "float64", 60.0
+    )
     with pytest.raises(KeyError, match=r"^'reward/out/bias'$"):
         adapter.symlog(np.ones(2))
     adapter.close()
@@ -353,15 +375,21 @@ def test_a_missing_parameter_is_named(tmp_path: Path) -> None:
 def test_a_field_that_a_configuration_lacks_is_answered_with_those_that_are_near(tmp_path: Path) -> None:
     source = "def kl_losses(posterior_logits, prior_logits, config):\n    return config.free_bits"
     (tmp_path / "mine.py").write_text(source, encoding="utf-8")
-    adapter = ProcessAdapter(shlex.join([sys.executable, "-m", "conformance.serve", str(tmp_path / "mine.py")]), "float64", 60.0)
+    adapter = ProcessAdapter(
+        shlex.join([sys.executable, "-m", "conformance.serve", str(tmp_path / "mine.py")]), "float64", 60.0
+    )
     with pytest.raises(CandidateError, match=r"(?s)AttributeError.*is free_nats meant instead of free_bits\?$"):
         adapter.kl_losses(np.ones(2), np.ones(2), small_config("paper"))
     adapter.close()
 
 
 def test_what_is_not_implemented_is_not_offered(tmp_path: Path) -> None:
-    (tmp_path / "mine.py").write_text("def symlog(x):\n    raise NotImplementedError('negative numbers')", encoding="utf-8")
-    adapter = ProcessAdapter(shlex.join([sys.executable, "-m", "conformance.serve", str(tmp_path / "mine.py")]), "float64", 60.0)
+    (tmp_path / "mine.py").write_text(
+        "def symlog(x):\n    raise NotImplementedError('negative numbers')", encoding="utf-8"
+    )
+    adapter = ProcessAdapter(
+        shlex.join([sys.executable, "-m", "conformance.serve", str(tmp_path / "mine.py")]), "float64", 60.0
+    )
     result = run_check(CHECKS["transforms.symlog_matches"], adapter, "float64", "paper")
     assert (result.status, result.message) == ("not offered", "not implemented: symlog (negative numbers)")
     adapter.close()
@@ -382,17 +410,26 @@ def test_the_server_alone(server: ProcessAdapter) -> None:
 
 def test_the_server_needs_only_numpy() -> None:
     source = ast.parse((ROOT / "conformance" / "serve.py").read_text(encoding="utf-8"), feature_version=(3, 8))
-    imported = {name.name.partition(".")[0] for node in ast.walk(source) if isinstance(node, ast.Import) for name in node.names}
+    imported = {
+        name.name.partition(".")[0] for node in ast.walk(source) if isinstance(node, ast.Import) for name in node.names
+    }
     imported |= {str(node.module).partition(".")[0] for node in ast.walk(source) if isinstance(node, ast.ImportFrom)}
     assert imported - set(sys.stdlib_module_names) == {"numpy"}
     assert "pickle" not in imported
-    code = "import sys, conformance.serve; print({'hypothesis', 'rich', 'spec', 'conformance.check'} & set(sys.modules))"
-    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True).stdout == "set()\n"
+    code = (
+        "import sys, conformance.serve; print({'hypothesis', 'rich', 'spec', 'conformance.check'} & set(sys.modules))"
+    )
+    assert (
+        subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+        == "set()\n"
+    )
 
 
 def test_the_server_as_a_module(tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text("import numpy as np\nfrom neighbour import symlog\n", encoding="utf-8")
-    (tmp_path / "neighbour.py").write_text("import numpy as np\n\n\ndef symlog(x):\n    return np.arcsinh(x)\n", encoding="utf-8")
+    (tmp_path / "neighbour.py").write_text(
+        "import numpy as np\n\n\ndef symlog(x):\n    return np.arcsinh(x)\n", encoding="utf-8"
+    )
     line = shlex.join([sys.executable, "-m", "conformance.serve", str(tmp_path / "mine.py")])
     adapter = ProcessAdapter(line, "float64", 60.0)
     assert result_of(adapter).status == "fail"
@@ -428,7 +465,8 @@ def test_other_dtypes_are_converted() -> None:
 
 @pytest.mark.slow
 def test_every_check_works_through_a_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The reference behind the door passes all checks but those of objects with methods, and every request of these is valid."""
+    """The reference behind the door passes all checks but those of objects with methods, and every request of these is
+    valid."""
     schema = json.loads((ROOT / "conformance" / "protocol.schema.json").read_text(encoding="utf-8"))
     validator = jsonschema.Draft202012Validator({"$ref": "#/$defs/request", "$defs": schema["$defs"]})
     send, requests = process.Connection.send, 0
@@ -441,12 +479,16 @@ def test_every_check_works_through_a_process(monkeypatch: pytest.MonkeyPatch) ->
 
     monkeypatch.setattr(process.Connection, "send", validated)
     adapter = ProcessAdapter(
-        shlex.join([sys.executable, "-m", "conformance.serve", str(FAKE.parent / "reference_adapter.py")]), "float64", 60.0
+        shlex.join([sys.executable, "-m", "conformance.serve", str(FAKE.parent / "reference_adapter.py")]),
+        "float64",
+        60.0,
     )
     results = [run_check(check, adapter, "float64", "paper", examples=1) for check in CHECKS.values()]
     adapter.close()
     assert [result.message for result in results if result.status in ("fail", "error")] == []
     reference = NumpyAdapter()
-    asked = {check.name for check in CHECKS.values() if not missing(reference, check) and not set(check.uses) & set(OBJECTS)}
+    asked = {
+        check.name for check in CHECKS.values() if not missing(reference, check) and not set(check.uses) & set(OBJECTS)
+    }
     assert {result.check.name for result in results if result.status == "pass"} == asked
     assert requests > len(asked)

@@ -21,7 +21,10 @@ from spec.spaces import Discrete, Image, Spaces, Vector
 
 LN_255 = 5.541263545158426
 TOY = Spaces({"vector": Vector(3)}, {"move": Discrete((2,))})
-RICH = Spaces({"image": Image(16, 16, 1), "code": Discrete((2, 3)), "vector": Vector(2)}, {"turn": Vector(2), "buttons": Discrete((2, 3))})
+RICH = Spaces(
+    {"image": Image(16, 16, 1), "code": Discrete((2, 3)), "vector": Vector(2)},
+    {"turn": Vector(2), "buttons": Discrete((2, 3))},
+)
 
 
 def toy_config(**overrides):
@@ -33,7 +36,9 @@ def fresh(config, spaces, noise=0.0, seed=0):
     """Initial parameters, moved away from their exact zeros if asked."""
     random = np.random.default_rng(seed)
     table = parameter_table(config, spaces)
-    uniforms = {name: random.random(entry.shape) for name, entry in table.items() if entry.initializer == "truncated_normal"}
+    uniforms = {
+        name: random.random(entry.shape) for name, entry in table.items() if entry.initializer == "truncated_normal"
+    }
     params = initial_parameters(table, uniforms)
     return {name: value + noise * random.standard_normal(value.shape) for name, value in params.items()}
 
@@ -162,7 +167,9 @@ def test_total_is_the_weighted_sum():
         "critic",
         "replay_critic",
     ]
-    assert total == pytest.approx(sum(scales.get(name, 1.0) * value for name, value in aux["losses"].items()), rel=1e-14)
+    assert total == pytest.approx(
+        sum(scales.get(name, 1.0) * value for name, value in aux["losses"].items()), rel=1e-14
+    )
 
 
 @pytest.mark.parametrize("profile", ["paper", "official"])
@@ -282,7 +289,9 @@ def test_gradients_reach_exactly_what_the_table_says():
         values(params)
     reached = {name: set() for name in REACH}
     for group in sorted(set(groups(params).values())):
-        direction = {name: random.standard_normal(params[name].shape) for name, g in groups(params).items() if g == group}
+        direction = {
+            name: random.standard_normal(params[name].shape) for name, g in groups(params).items() if g == group
+        }
         results = []
         for sign in (1, -1):
             with replaying(tape):
@@ -317,7 +326,9 @@ def test_derivative_by_hand():
     params, batch = fresh(config, TOY), make_batch(toy_config(), TOY, reward=np.zeros((2, 4)))
     for index, expected in ((127, 1 / 255 - 1), (3, 1 / 255)):
         direction = {"reward/out/bias": np.eye(255)[index]}
-        derivative = directional_derivative(lambda point: evaluate(point, config, TOY, batch)[0], params, direction, 1e-4)
+        derivative = directional_derivative(
+            lambda point: evaluate(point, config, TOY, batch)[0], params, direction, 1e-4
+        )
         assert derivative == pytest.approx(expected, abs=1e-8)
 
 
@@ -329,7 +340,9 @@ def test_directional_derivative_holds_constants():
     params = {"x": np.array([2.0, -1.0]), "y": np.array(5.0)}
     # d/dx x^2 sg(x) = 2 x sg(x) = 8 and 2
     assert directional_derivative(function, params, {"x": np.array([1.0, 0.0])}, 1e-3) == pytest.approx(8.0, rel=1e-10)
-    assert directional_derivative(function, params, {"x": np.array([0.5, 3.0]), "y": 1.0}, 1e-3) == pytest.approx(11.0, rel=1e-10)
+    assert directional_derivative(function, params, {"x": np.array([0.5, 3.0]), "y": 1.0}, 1e-3) == pytest.approx(
+        11.0, rel=1e-10
+    )
     with pytest.raises(ValueError, match="unknown"):
         directional_derivative(function, params, {"z": 1.0}, 1e-3)
     with pytest.raises(ValueError, match="step"):
@@ -362,7 +375,11 @@ def test_train_step():
 def test_errors_name_the_argument():
     config = toy_config()
     params = fresh(config, TOY)
-    for name, wrong in (("deter", np.zeros((2, 7))), ("prev_action", np.zeros((2, 4, 1))), ("is_last", np.zeros((2, 3), bool))):
+    for name, wrong in (
+        ("deter", np.zeros((2, 7))),
+        ("prev_action", np.zeros((2, 4, 1))),
+        ("is_last", np.zeros((2, 3), bool)),
+    ):
         with pytest.raises(ValueError, match=name):
             evaluate(params, config, TOY, make_batch(config, TOY, **{name: wrong}))
     with pytest.raises(ValueError, match="stoch"):

@@ -1,4 +1,5 @@
-"""Actions, actor and critic losses, slow critic: numbers from spec/08-behavior.md, and gradients by central differences."""
+"""Actions, actor and critic losses, slow critic: numbers from spec/08-behavior.md, and gradients by central
+differences."""
 
 import math
 
@@ -72,10 +73,14 @@ def test_discrete_action_uses_the_mixture(uniform, index):
 def test_discrete_log_prob_and_entropy_use_the_mixture():
     """[BEH-2], [BEH-6], [BEH-7]"""
     outputs = {"a": {"logits": [[LN3, 0.0], [LN3, 0.0]]}}
-    np.testing.assert_allclose(action_log_prob(outputs, np.eye(2), ONE_CATEGORICAL, CONFIG), [-0.291021, -1.376344], atol=5e-7)
+    np.testing.assert_allclose(
+        action_log_prob(outputs, np.eye(2), ONE_CATEGORICAL, CONFIG), [-0.291021, -1.376344], atol=5e-7
+    )
     np.testing.assert_allclose(action_entropy(outputs, ONE_CATEGORICAL, CONFIG), [0.565065, 0.565065], atol=5e-7)
     plain = load_config("official")
-    np.testing.assert_allclose(action_log_prob(outputs, np.eye(2), ONE_CATEGORICAL, plain), np.log([0.75, 0.25]), rtol=1e-14)
+    np.testing.assert_allclose(
+        action_log_prob(outputs, np.eye(2), ONE_CATEGORICAL, plain), np.log([0.75, 0.25]), rtol=1e-14
+    )
 
 
 def test_flat_action_layout_and_noise_order():
@@ -89,13 +94,17 @@ def test_flat_action_layout_and_noise_order():
     # ln 1/2 + ln 1/3, and two normals: noise 2 and -1.
     expected = -math.log(6) - 2.5 - 2 * math.log(STD_AT_ZERO) - math.log(2 * math.pi)
     np.testing.assert_allclose(action_log_prob(outputs, action, MIXED, CONFIG), [expected], rtol=1e-14)
-    np.testing.assert_allclose(action_entropy(outputs, MIXED, CONFIG), [math.log(6) + 2 * 1.305453290244865], rtol=1e-14)
+    np.testing.assert_allclose(
+        action_entropy(outputs, MIXED, CONFIG), [math.log(6) + 2 * 1.305453290244865], rtol=1e-14
+    )
 
 
 def test_a_single_class_takes_its_uniform():
     """[BEH-1]: the noise of a certain choice is consumed."""
     spaces = Spaces(OBSERVATIONS, {"a": Discrete((1, 2))})
-    np.testing.assert_array_equal(sample_action({"a": {"logits": [0.0, 0.0, 0.0]}}, [0.9, 0.2], spaces, CONFIG), [1, 1, 0])
+    np.testing.assert_array_equal(
+        sample_action({"a": {"logits": [0.0, 0.0, 0.0]}}, [0.9, 0.2], spaces, CONFIG), [1, 1, 0]
+    )
 
 
 def test_score_gradient_of_a_sampled_action():
@@ -188,7 +197,9 @@ def test_replay_critic_loss_masks_last_steps():
 
 def test_replay_critic_loss_of_no_steps():
     """[BEH-14]: T = 1."""
-    assert replay_critic_loss(np.zeros((2, 0, 255)), np.zeros((2, 0, 255)), np.zeros((2, 0)), np.zeros((2, 0)), CONFIG).shape == (2, 0)
+    assert replay_critic_loss(
+        np.zeros((2, 0, 255)), np.zeros((2, 0, 255)), np.zeros((2, 0)), np.zeros((2, 0)), CONFIG
+    ).shape == (2, 0)
 
 
 def test_replay_critic_loss_gradients():
@@ -208,13 +219,20 @@ def test_replay_critic_loss_gradients():
 
 def test_update_slow_critic():
     """[BEH-19]"""
-    updated = update_slow_critic({"critic/out/bias": [1.0, 5.0]}, {"critic/out/bias": [2.0, 5.0], "actor/out/bias": [9.0]}, 0.98)
+    updated = update_slow_critic(
+        {"critic/out/bias": [1.0, 5.0]}, {"critic/out/bias": [2.0, 5.0], "actor/out/bias": [9.0]}, 0.98
+    )
     assert set(updated) == {"critic/out/bias"}
     np.testing.assert_allclose(updated["critic/out/bias"], [1.02, 5.0], rtol=1e-15)
 
 
 @pytest.mark.parametrize(
-    "critic", [{"critic/a": [1.0]}, {"critic/a": [1.0], "critic/b": [1.0, 2.0]}, {"critic/a": [1.0], "critic/b": [1.0], "critic/c": [1.0]}]
+    "critic",
+    [
+        {"critic/a": [1.0]},
+        {"critic/a": [1.0], "critic/b": [1.0, 2.0]},
+        {"critic/a": [1.0], "critic/b": [1.0], "critic/c": [1.0]},
+    ],
 )
 def test_update_slow_critic_refuses_other_names_and_shapes(critic):
     """[BEH-20]"""

@@ -76,7 +76,9 @@ def test_sample_at_boundaries_and_zero_probabilities():
     np.testing.assert_array_equal(categorical_sample(np.log([0.5, 0.5]), 0.5), [0, 1])
     np.testing.assert_array_equal(categorical_sample([-np.inf, 0.0], 0.0), [0, 1])
     np.testing.assert_array_equal(categorical_sample([0.0], 0.99), [1])
-    np.testing.assert_array_equal(categorical_sample(np.log([[0.2, 0.5, 0.3]] * 4), [0.1, 0.2, 0.69, 0.71]).argmax(-1), [0, 1, 1, 2])
+    np.testing.assert_array_equal(
+        categorical_sample(np.log([[0.2, 0.5, 0.3]] * 4), [0.1, 0.2, 0.69, 0.71]).argmax(-1), [0, 1, 1, 2]
+    )
     assert categorical_sample([np.nan, np.nan], 0.5).sum() == 1
 
 
@@ -124,7 +126,9 @@ def test_symexp_twohot():
     assert symexp_twohot_loss(logits, 2.0, SMALL) == pytest.approx(2 * LN2, rel=1e-13)
     assert symexp_twohot_mean(logits, SMALL) == pytest.approx(1.125, rel=1e-13)
     bins = exponential_bins(255)
-    np.testing.assert_allclose(symexp_twohot_loss(np.zeros((3, 255)), [0.0, 12.3, -1e12], bins), [5.541263545158426] * 3, rtol=1e-13)
+    np.testing.assert_allclose(
+        symexp_twohot_loss(np.zeros((3, 255)), [0.0, 12.3, -1e12], bins), [5.541263545158426] * 3, rtol=1e-13
+    )
     np.testing.assert_array_equal(symexp_twohot_mean(np.full((2, 255), 3.7), bins), [0.0, 0.0])
     assert np.isnan(symexp_twohot_loss(np.zeros(255), np.nan, bins))
 
@@ -160,8 +164,12 @@ def test_bernoulli_loss(logit, target, loss):
 
 def test_bernoulli_gradient_and_mean():
     logits = np.array([-3.0, 0.0, 2.0])
-    np.testing.assert_allclose(gradient(lambda x: bernoulli_loss(x, [0.3] * 3), logits), bernoulli_mean(logits) - 0.3, atol=1e-8)
-    np.testing.assert_allclose(bernoulli_mean([-np.inf, -2.0, 0.0, 2.0, np.inf]), [0, 0.11920292202211755, 0.5, 0.8807970779778823, 1])
+    np.testing.assert_allclose(
+        gradient(lambda x: bernoulli_loss(x, [0.3] * 3), logits), bernoulli_mean(logits) - 0.3, atol=1e-8
+    )
+    np.testing.assert_allclose(
+        bernoulli_mean([-np.inf, -2.0, 0.0, 2.0, np.inf]), [0, 0.11920292202211755, 0.5, 0.8807970779778823, 1]
+    )
     assert bernoulli_mean(-100.0) == pytest.approx(3.720075976020836e-44, rel=1e-12)
     assert np.isnan(bernoulli_loss([np.nan] * 2, [0.0, 1.0])).all()
 

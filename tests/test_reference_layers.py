@@ -59,7 +59,9 @@ def test_rms_norm():
 
 def test_silu():
     np.testing.assert_allclose(silu([1, -1, 2, -20]), [0.7310586, -0.2689414, 1.7615942, -4.1223072e-8], rtol=1e-6)
-    np.testing.assert_array_equal(silu([0.0, -0.0, np.inf, -np.inf, np.nan, -1e30, 3e38]), [0, 0, np.inf, np.nan, np.nan, 0, 3e38])
+    np.testing.assert_array_equal(
+        silu([0.0, -0.0, np.inf, -np.inf, np.nan, -1e30, 3e38]), [0, 0, np.inf, np.nan, np.nan, 0, 3e38]
+    )
 
 
 def test_convolution_with_stride_1_counts_taps():
@@ -101,7 +103,9 @@ def test_convolution_mixes_channels_and_keeps_leading_axes():
 def test_transposed_convolution():
     weights = np.add.outer(10 * np.arange(5), np.arange(5))[..., None, None]
     np.testing.assert_array_equal(transposed_convolution([[[1.0]]], weights, NO_BIAS)[..., 0], [[11, 12], [21, 22]])
-    np.testing.assert_array_equal(transposed_convolution(np.ones((2, 2, 1)), ONES, NO_BIAS)[..., 0], np.outer([1, 2, 2, 2], [1, 2, 2, 2]))
+    np.testing.assert_array_equal(
+        transposed_convolution(np.ones((2, 2, 1)), ONES, NO_BIAS)[..., 0], np.outer([1, 2, 2, 2], [1, 2, 2, 2])
+    )
     np.testing.assert_array_equal(transposed_convolution(np.zeros((1, 1, 1)), ONES, [7.0])[..., 0], [[7, 7], [7, 7]])
 
 

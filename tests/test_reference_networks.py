@@ -143,7 +143,9 @@ def test_order_inside_encoder_stages(monkeypatch, sampling, outer, expected):
     seen = []
     for name, label in (("convolution", "conv"), ("max_pool", "pool"), ("rms_norm", "norm"), ("silu", "silu")):
         original = getattr(networks, name)
-        monkeypatch.setattr(networks, name, lambda *rest, label=label, original=original: (seen.append(label), original(*rest))[1])
+        monkeypatch.setattr(
+            networks, name, lambda *rest, label=label, original=original: (seen.append(label), original(*rest))[1]
+        )
     networks.encoder(make_params(config, spaces), {"view": np.zeros((4, 4, 2), np.uint8)}, spaces, config)
     assert " ".join(seen) == expected
 
@@ -153,7 +155,9 @@ def test_tokens_are_vectors_then_images(monkeypatch):
     config = small_config(blocks=1, cnn_depth=1, cnn_multipliers=(1, 1))
     monkeypatch.setattr(networks, "_encode_image", lambda params, x, config: np.arange(4.0).reshape(1, 1, 2, 2))
     monkeypatch.setattr(networks, "mlp", lambda params, name, x, *rest: x)
-    tokens = networks.encoder({}, {"view": np.zeros((2, 4, 1), np.uint8), "zoom": np.zeros(1) + math.e - 1}, spaces, config)
+    tokens = networks.encoder(
+        {}, {"view": np.zeros((2, 4, 1), np.uint8), "zoom": np.zeros(1) + math.e - 1}, spaces, config
+    )
     np.testing.assert_allclose(tokens, [1, 0, 1, 2, 3])
 
 
@@ -177,7 +181,10 @@ def test_stem_reads_memory_and_latents():
     params = make_params(config, spaces)
     feature = np.random.default_rng(1).normal(size=config.feature_size)
     image = networks.decoder(params, feature, spaces, config)["view"]
-    for part, blind in ((slice(0, 4), "decoder/image/deter/kernel"), (slice(4, None), "decoder/image/stoch_hidden/kernel")):
+    for part, blind in (
+        (slice(0, 4), "decoder/image/deter/kernel"),
+        (slice(4, None), "decoder/image/stoch_hidden/kernel"),
+    ):
         moved = feature.copy()
         moved[part] += 1.0
         assert not np.array_equal(networks.decoder(params, moved, spaces, config)["view"], image)
@@ -281,7 +288,11 @@ def test_leading_axes_are_independent(sampling, outer):
     tokens = networks.encoder(params, batch, spaces, config)
     one = networks.encoder(params, {key: value[1, 2] for key, value in batch.items()}, spaces, config)
     np.testing.assert_allclose(tokens[1, 2], one, rtol=1e-12)
-    assert tokens.shape == (2, 3, parameter_table(config, spaces)["rssm/posterior/hidden0/kernel"].shape[0] - config.deter)
+    assert tokens.shape == (
+        2,
+        3,
+        parameter_table(config, spaces)["rssm/posterior/hidden0/kernel"].shape[0] - config.deter,
+    )
     feature = generator.normal(size=(2, 3, config.feature_size))
     together = networks.decoder(params, feature, spaces, config)
     alone = networks.decoder(params, feature[1, 2], spaces, config)

@@ -47,7 +47,9 @@ def test_clip_0_lets_no_gradient_through():
 def test_norms_survive_huge_and_tiny_entries():
     """[OPT-3]: the squares would be infinite, or zero."""
     np.testing.assert_allclose(adaptive_gradient_clip([6e200, 8e200], [3, 4], 0.3, 1e-3), [0.9, 1.2], rtol=1e-14)
-    np.testing.assert_allclose(adaptive_gradient_clip([6e-200, 8e-200], [3e-200, 4e-200], 0.3, 0.0), [0.9e-200, 1.2e-200], rtol=1e-14)
+    np.testing.assert_allclose(
+        adaptive_gradient_clip([6e-200, 8e-200], [3e-200, 4e-200], 0.3, 0.0), [0.9e-200, 1.2e-200], rtol=1e-14
+    )
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
@@ -60,7 +62,9 @@ def test_non_finite_tensors_become_nan(bad):
 def test_learning_rate():
     """[OPT-6]: the first warmup update has rate 0."""
     assert [learning_rate(step, PAPER) for step in (0, 1, 10**6)] == [4e-5] * 3
-    np.testing.assert_allclose([learning_rate(step, OFFICIAL) for step in (0, 1, 500, 1000, 5000)], [0, 4e-8, 2e-5, 4e-5, 4e-5], rtol=1e-15)
+    np.testing.assert_allclose(
+        [learning_rate(step, OFFICIAL) for step in (0, 1, 500, 1000, 5000)], [0, 4e-8, 2e-5, 4e-5, 4e-5], rtol=1e-15
+    )
     assert learning_rate(0, OFFICIAL) == 0
     np.testing.assert_allclose(sum(1 - learning_rate(step, OFFICIAL) / 4e-5 for step in range(1000)), 500.5, rtol=1e-12)
     with pytest.raises(ValueError, match="step"):
@@ -161,7 +165,9 @@ def test_non_finite_gradients_are_not_repaired():
     """[OPT-20]: their tensor is lost, the others are not, also with learning rate 0."""
     params = {"a": np.array([3.0, 4.0]), "b": np.array([1.0])}
     for config in (PAPER, OFFICIAL):
-        new, state = optimizer_step(params, {"a": np.array([math.inf, 0.0]), "b": np.array([0.1])}, fresh(params), config)
+        new, state = optimizer_step(
+            params, {"a": np.array([math.inf, 0.0]), "b": np.array([0.1])}, fresh(params), config
+        )
         assert np.isnan(new["a"]).all()
         assert np.isnan(state["second_moment"]["a"]).all()
         assert np.isnan(state["momentum"]["a"]).all()

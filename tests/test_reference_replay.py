@@ -46,7 +46,8 @@ def test_worked_example_of_the_chapter():
     fresh = latents(2, 2)
     fresh["deter"][1] = 6.0
     replay.write_back(batch["ids"], fresh)
-    # item 1, 2, 3 start at records 1, 2, 3: record 1 is a context only, 2 is row 0's, 3 belongs to both rows and the later one wins
+    # item 1, 2, 3 start at records 1, 2, 3: record 1 is a context only, 2 is row 0's, 3 belongs to both rows and the
+    # later one wins
     assert replay.sample([0.0, 0.4, 0.9], online=False)["deter"][:, 0].tolist() == [1, 5, 6]
 
 

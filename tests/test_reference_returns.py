@@ -51,7 +51,9 @@ def test_arrival_at_a_terminal_state_counts_its_reward_and_nothing_else():
 
 def test_lambda_return_of_a_single_transition():
     """[RET-1]"""
-    np.testing.assert_array_equal(lambda_return([[0, 1], [0, 2]], [[1, 1], [1, 0]], [[0, 8], [0, 8]], 0.5, 0.95), [[5], [2]])
+    np.testing.assert_array_equal(
+        lambda_return([[0, 1], [0, 2]], [[1, 1], [1, 0]], [[0, 8], [0, 8]], 0.5, 0.95), [[5], [2]]
+    )
 
 
 def test_discount_is_used_once_in_each_profile():
@@ -67,7 +69,9 @@ def test_discount_is_used_once_in_each_profile():
 
 def test_cumulative_weights_by_hand():
     """[RET-7]: the discount of the first factor is divided away, the last continue is not used."""
-    np.testing.assert_array_equal(cumulative_weights([[1, 1, 0.5, math.nan], [0, 1, 1, 1]], 0.5), [[1, 0.5, 0.125], [0, 0, 0]])
+    np.testing.assert_array_equal(
+        cumulative_weights([[1, 1, 0.5, math.nan], [0, 1, 1, 1]], 0.5), [[1, 0.5, 0.125], [0, 0, 0]]
+    )
     np.testing.assert_array_equal(cumulative_weights([[0.5, 0.5, 0.5]], 1), [[0.5, 0.25]])
 
 
@@ -98,7 +102,9 @@ def test_cumulative_weights_refuse_a_discount(discount):
 def test_replay_lambda_return_by_hand(is_last, is_terminal, expected):
     """[RET-9]: no end, cut off, terminal; flags as numbers and as booleans."""
     rewards, annotations = [[0, 1, 2, 0, 3]], [[8, 4, 6, 10, 2]]
-    np.testing.assert_array_equal(replay_lambda_return(rewards, [is_last], [is_terminal], annotations, 0.5, 0.5), [expected])
+    np.testing.assert_array_equal(
+        replay_lambda_return(rewards, [is_last], [is_terminal], annotations, 0.5, 0.5), [expected]
+    )
     flags = np.array([is_last], bool), np.array([is_terminal], bool)
     np.testing.assert_array_equal(replay_lambda_return(rewards, *flags, annotations, 0.5, 0.5), [expected])
 
@@ -121,7 +127,9 @@ def test_an_end_hides_the_next_episode():
     """[RET-10]: neither what comes after an end nor anything at index 0 changes the returns before it."""
     last = [[0, 0, 1, 0, 0]]
     one = replay_lambda_return([[0, 1, 2, 0, 3]], last, np.zeros((1, 5)), [[8, 4, 6, 10, 2]], 0.5, 0.5)
-    two = replay_lambda_return([[7, 1, 2, 50, -3]], [[1, 0, 1, 1, 0]], [[1, 0, 0, 1, 0]], [[9, 4, 6, -10, 20]], 0.5, 0.5)
+    two = replay_lambda_return(
+        [[7, 1, 2, 50, -3]], [[1, 0, 1, 1, 0]], [[1, 0, 0, 1, 0]], [[9, 4, 6, -10, 20]], 0.5, 0.5
+    )
     np.testing.assert_array_equal(one[:, :2], two[:, :2])
 
 
@@ -165,7 +173,9 @@ def test_return_range_needs_69_steps_for_half():
     """[RET-15]"""
     low = high = 0.0
     for _ in range(69):
-        low, high = update_return_range(low, high, [[0.0, 100.0]], load_config(return_percentile_low=0, return_percentile_high=100))
+        low, high = update_return_range(
+            low, high, [[0.0, 100.0]], load_config(return_percentile_low=0, return_percentile_high=100)
+        )
     np.testing.assert_allclose([low, high], [0, 50.016297], rtol=1e-7)
 
 

@@ -65,7 +65,9 @@ def test_gates_are_split_inside_each_block():
     config = small_config()
     c = np.arctanh([0.1, 0.2, 0.3, 0.4])
     bias = np.array([100, 100, c[0], c[1], 100, 100, 100, 100, c[2], c[3], 100, 100])
-    deter = rssm.core(zero_params(config) | {"rssm/gru/bias": bias}, np.ones(4), np.zeros((2, 3)), np.zeros(ACTION), config)
+    deter = rssm.core(
+        zero_params(config) | {"rssm/gru/bias": bias}, np.ones(4), np.zeros((2, 3)), np.zeros(ACTION), config
+    )
     np.testing.assert_allclose(deter, [0.1, 0.2, 0.3, 0.4], atol=1e-12)
 
 
@@ -85,7 +87,9 @@ def test_embedded_values(monkeypatch):
     config = small_config()
     seen = {}
     original = rssm.dense
-    monkeypatch.setattr(rssm, "dense", lambda params, name, x, epsilon: (seen.update({name: x}), original(params, name, x, epsilon))[1])
+    monkeypatch.setattr(
+        rssm, "dense", lambda params, name, x, epsilon: (seen.update({name: x}), original(params, name, x, epsilon))[1]
+    )
     stoch = [[0, 1, 0], [0, 0, 1]]
     with recording() as tape:
         rssm.core(zero_params(config), np.zeros(4), stoch, [-3.0, 0.5, 2.0], config)
@@ -97,7 +101,8 @@ def test_embedded_values(monkeypatch):
 
 
 def test_hidden_layer_is_normalized_over_all_blocks():
-    """With equal gates, units of different blocks differ only through the hidden layer: one large block shrinks the other."""
+    """With equal gates, units of different blocks differ only through the hidden layer: one large block shrinks the
+    other."""
     config = small_config(norm_epsilon=1e-30)
     params = zero_params(config)
     params["rssm/hidden/bias"] = np.array([1.0, 1.0, 7.0, 7.0])
@@ -115,28 +120,40 @@ def test_logits_of_prior_and_posterior():
     bias = np.arange(6.0)
     params = zero_params(config) | {"rssm/prior/out/bias": bias, "rssm/posterior/out/bias": -bias}
     assert rssm.prior(params, np.ones((7, 4)), config)[6].tolist() == [[0, 1, 2], [3, 4, 5]]
-    assert rssm.posterior(params, np.ones((7, 4)), np.ones((7, TOKENS)), config)[6].tolist() == [[0, -1, -2], [-3, -4, -5]]
+    assert rssm.posterior(params, np.ones((7, 4)), np.ones((7, TOKENS)), config)[6].tolist() == [
+        [0, -1, -2],
+        [-3, -4, -5],
+    ]
 
 
 def test_posterior_reads_memory_then_tokens(monkeypatch):
     config = small_config()
     seen = []
     original = rssm.mlp
-    monkeypatch.setattr(rssm, "mlp", lambda params, name, x, *rest: (seen.append(x), original(params, name, x, *rest))[1])
+    monkeypatch.setattr(
+        rssm, "mlp", lambda params, name, x, *rest: (seen.append(x), original(params, name, x, *rest))[1]
+    )
     rssm.posterior(zero_params(config), [1.0, 2, 3, 4], [5.0, 6, 7, 8, 9], config)
     assert seen[0].tolist() == [1, 2, 3, 4, 5, 6, 7, 8, 9]
 
 
-@pytest.mark.parametrize(("uniform", "unimix", "index"), [(0.251, 0.01, 0), (0.253, 0.01, 1), (0.251, 0.0, 1), (0.0, 0.01, 0)])
+@pytest.mark.parametrize(
+    ("uniform", "unimix", "index"), [(0.251, 0.01, 0), (0.253, 0.01, 1), (0.251, 0.0, 1), (0.0, 0.01, 0)]
+)
 def test_sampling_uses_the_mixture(uniform, unimix, index):
     config = small_config(stoch=1, classes=2, latent_unimix=unimix)
     logits = [0.0, math.log(3.0)]
-    params = zero_params(config) | {"rssm/prior/out/bias": np.array(logits), "rssm/posterior/out/bias": np.array(logits)}
+    params = zero_params(config) | {
+        "rssm/prior/out/bias": np.array(logits),
+        "rssm/posterior/out/bias": np.array(logits),
+    }
     carry = {"deter": np.zeros((1, 4)), "stoch": np.zeros((1, 1, 2))}
     expected = np.eye(2)[index].tolist()
     states = rssm.imagine(params, carry, lambda feature, t: np.zeros((1, ACTION)), [[[uniform]]], config)
     assert states["stoch"][0, 1, 0].tolist() == expected
-    state, returned = rssm.observe_step(params, carry, np.zeros((1, TOKENS)), np.zeros((1, ACTION)), [False], [[uniform]], config)
+    state, returned = rssm.observe_step(
+        params, carry, np.zeros((1, TOKENS)), np.zeros((1, ACTION)), [False], [[uniform]], config
+    )
     assert state["stoch"][0, 0].tolist() == expected
     np.testing.assert_allclose(returned, [[logits]])
 
@@ -145,7 +162,13 @@ def test_straight_through_gradient():
     """dz/dlogit is that of the mixed probabilities: 0.99 * p * (1 - p) on the diagonal."""
     config = small_config(stoch=1, classes=2)
     params = zero_params(config) | {"rssm/posterior/out/bias": np.array([0.0, math.log(3.0)])}
-    arguments = ({"deter": np.zeros((1, 4)), "stoch": np.zeros((1, 1, 2))}, np.zeros((1, TOKENS)), np.zeros((1, ACTION)), [False], [[0.1]])
+    arguments = (
+        {"deter": np.zeros((1, 4)), "stoch": np.zeros((1, 1, 2))},
+        np.zeros((1, TOKENS)),
+        np.zeros((1, ACTION)),
+        [False],
+        [[0.1]],
+    )
     with recording() as tape:
         rssm.observe_step(params, *arguments, config)
     samples = []
@@ -243,13 +266,19 @@ def test_imagine():
 
     with recording() as tape:
         states = rssm.imagine(params, inputs["carry"], policy, uniform, config)
-    assert {name: value.shape for name, value in states.items()} == {"deter": (3, 5, 4), "stoch": (3, 5, 2, 3), "action": (3, 4, ACTION)}
+    assert {name: value.shape for name, value in states.items()} == {
+        "deter": (3, 5, 4),
+        "stoch": (3, 5, 2, 3),
+        "action": (3, 4, ACTION),
+    }
     assert [t for t, _ in calls] == [0, 1, 2, 3]
     assert np.array_equal(states["deter"][:, 0], inputs["carry"]["deter"])
     assert np.array_equal(states["stoch"][:, 0], inputs["carry"]["stoch"])
     for t in range(4):
         assert np.array_equal(states["action"][:, t], actions[t])
-        assert np.array_equal(calls[t][1], np.concatenate([states["deter"][:, t], states["stoch"][:, t].reshape(3, 6)], -1))
+        assert np.array_equal(
+            calls[t][1], np.concatenate([states["deter"][:, t], states["stoch"][:, t].reshape(3, 6)], -1)
+        )
         deter = rssm.core(params, states["deter"][:, t], states["stoch"][:, t], actions[t], config)
         assert np.array_equal(states["deter"][:, t + 1], deter)
         probs = np.exp(rssm.unimix_log_probs(rssm.prior(params, deter, config), config.latent_unimix))
@@ -270,12 +299,17 @@ def test_zeros_as_a_discrete_action_differ_from_class_zero():
     inputs["is_first"][:] = True
     reset = run(params, inputs, config)
     zeros = {"deter": np.zeros((3, 4)), "stoch": np.zeros((3, 2, 3))}
-    inputs = inputs | {"carry": zeros, "is_first": np.zeros((3, 1), bool), "prev_action": np.tile([1.0, 0, 0], (3, 1, 1))}
+    inputs = inputs | {
+        "carry": zeros,
+        "is_first": np.zeros((3, 1), bool),
+        "prev_action": np.tile([1.0, 0, 0], (3, 1, 1)),
+    }
     assert not np.array_equal(reset["deter"], run(params, inputs, config)["deter"])
 
 
 @pytest.mark.parametrize(
-    ("name", "shape"), [("tokens", (3, 6, 4)), ("prev_action", (3, 5, 3)), ("is_first", (3,)), ("uniform", (3, 6, 2, 3))]
+    ("name", "shape"),
+    [("tokens", (3, 6, 4)), ("prev_action", (3, 5, 3)), ("is_first", (3,)), ("uniform", (3, 6, 2, 3))],
 )
 def test_wrong_shapes_are_refused(name, shape):
     config = small_config()

@@ -4,7 +4,14 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from reference_numpy.training_loop import ReplayRatio, can_train, derive_seed, environment_action, make_record, step_flags
+from reference_numpy.training_loop import (
+    ReplayRatio,
+    can_train,
+    derive_seed,
+    environment_action,
+    make_record,
+    step_flags,
+)
 from spec.config import load_config
 from spec.spaces import Discrete, Spaces, Vector
 

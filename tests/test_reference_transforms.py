@@ -9,12 +9,16 @@ SMALL = [-3.0, -1.0, 0.0, 1.0, 3.0]
 
 
 def test_symlog():
-    np.testing.assert_allclose(symlog([1.0, -10.0, 100.0]), [0.6931471805599453, -2.3978952727983707, 4.61512051684126], rtol=1e-15)
+    np.testing.assert_allclose(
+        symlog([1.0, -10.0, 100.0]), [0.6931471805599453, -2.3978952727983707, 4.61512051684126], rtol=1e-15
+    )
     assert symlog(1e-8) == pytest.approx(9.999999950000001e-09, rel=1e-15)
 
 
 def test_symexp():
-    np.testing.assert_allclose(symexp([1.0, -2.0, 20.0]), [1.718281828459045, -6.38905609893065, 485165194.4097903], rtol=1e-15)
+    np.testing.assert_allclose(
+        symexp([1.0, -2.0, 20.0]), [1.718281828459045, -6.38905609893065, 485165194.4097903], rtol=1e-15
+    )
 
 
 def test_symlog_and_symexp_are_inverse():
@@ -38,7 +42,9 @@ def test_bins():
     np.testing.assert_allclose(bins[[0, 254]], [-485165194.4097903, 485165194.4097903], rtol=1e-14)
     np.testing.assert_array_equal(bins, -bins[::-1])
     assert np.all(np.diff(bins) > 0)
-    np.testing.assert_allclose(exponential_bins(5), [-485165194.41, -22025.4658, 0, 22025.4658, 485165194.41], rtol=1e-9)
+    np.testing.assert_allclose(
+        exponential_bins(5), [-485165194.41, -22025.4658, 0, 22025.4658, 485165194.41], rtol=1e-9
+    )
 
 
 @pytest.mark.parametrize("bins", [0, 1, 2, 254])
@@ -67,7 +73,8 @@ def test_twohot(x, expected):
 
 
 @pytest.mark.parametrize(
-    ("x", "lower", "weight"), [(0.1, 127, 0.4136882061551783), (1.0, 131, 0.6173290787033168), (300.0, 163, 0.7740168904329725)]
+    ("x", "lower", "weight"),
+    [(0.1, 127, 0.4136882061551783), (1.0, 131, 0.6173290787033168), (300.0, 163, 0.7740168904329725)],
 )
 def test_twohot_interpolates_in_raw_space(x, lower, weight):
     weights = twohot(x, exponential_bins(255))

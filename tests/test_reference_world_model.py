@@ -15,7 +15,15 @@ ONE_KL = 0.128082135
 
 
 def small_config(profile="paper", **overrides):
-    values = {"units": 3, "deter": 4, "blocks": 2, "stoch": 2, "classes": 2, "cnn_depth": 2, "cnn_multipliers": (1, 1)} | overrides
+    values = {
+        "units": 3,
+        "deter": 4,
+        "blocks": 2,
+        "stoch": 2,
+        "classes": 2,
+        "cnn_depth": 2,
+        "cnn_multipliers": (1, 1),
+    } | overrides
     return load_config(profile, size="tiny", **values)
 
 
@@ -32,7 +40,9 @@ def test_continue_target(kind, going_on):
 @pytest.mark.parametrize(("stoch", "value"), [(2, 1.0), (7, 1.0), (8, 8 * ONE_KL), (10, 1.280821352)])
 def test_kl_is_summed_over_latents_then_clipped(stoch, value):
     config = small_config(stoch=stoch)
-    dynamics, representation = world_model.kl_losses(logits(*[POSTERIOR] * stoch), logits(*[[0.0, 0.0]] * stoch), config)
+    dynamics, representation = world_model.kl_losses(
+        logits(*[POSTERIOR] * stoch), logits(*[[0.0, 0.0]] * stoch), config
+    )
     np.testing.assert_allclose(dynamics, [value], rtol=1e-8)
     assert np.array_equal(dynamics, representation)
 
@@ -45,7 +55,8 @@ def test_kl_goes_from_posterior_to_prior():
 
 
 def test_clipping_is_per_element():
-    """Summed KLs of 0.2, 0.4, 3 and 0.4 nats become 1, 1, 3, 1. Without mixture a binary posterior can have any KL below ln 2."""
+    """Summed KLs of 0.2, 0.4, 3 and 0.4 nats become 1, 1, 3, 1. Without mixture a binary posterior can have any KL
+    below ln 2."""
     config = small_config(stoch=5, latent_unimix=0.0)
     rows = []
     for nats in (0.2, 0.4, 3.0, 0.4):
@@ -91,7 +102,9 @@ def test_free_nats_leave_no_gradient():
 
 
 def test_kl_keeps_nan_and_is_bounded():
-    dynamics, representation = world_model.kl_losses(logits([np.nan, 0], [0, 0]), logits([0, 0], [0, 0]), small_config())
+    dynamics, representation = world_model.kl_losses(
+        logits([np.nan, 0], [0, 0]), logits([0, 0], [0, 0]), small_config()
+    )
     assert np.isnan([dynamics, representation]).all()
     config = load_config(size="200m")
     first, last = np.full((32, 64), -1e4), np.full((32, 64), -1e4)
@@ -110,7 +123,9 @@ def test_vector_loss(profile, value):
 def test_discrete_loss(profile):
     spaces = Spaces({"kind": Discrete((2, 3))}, ACTIONS)
     prediction = [[0.0, math.log(3.0), 0.0, 0.0, 0.0]]
-    losses = world_model.reconstruction_losses({"kind": prediction}, {"kind": np.array([[0, 2]])}, spaces, small_config(profile))
+    losses = world_model.reconstruction_losses(
+        {"kind": prediction}, {"kind": np.array([[0, 2]])}, spaces, small_config(profile)
+    )
     np.testing.assert_allclose(losses["kind"], [math.log(4) + math.log(3)])
     with pytest.raises(ValueError, match=r"'kind', entry 1: expected values in 0 \.\. 2, got 3"):
         world_model.reconstruction_losses({"kind": prediction}, {"kind": np.array([[0, 3]])}, spaces, small_config())
@@ -125,7 +140,9 @@ def test_image_loss():
     np.testing.assert_allclose(losses["a"], [12 * 0.01])
     np.testing.assert_allclose(losses["b"], [4 * 0.25])
     with pytest.raises(ValueError, match="'b': an Image needs the dtype uint8, got float32"):
-        world_model.reconstruction_losses(predictions, {"a": dark, "b": bright.astype(np.float32)}, spaces, small_config())
+        world_model.reconstruction_losses(
+            predictions, {"a": dark, "b": bright.astype(np.float32)}, spaces, small_config()
+        )
 
 
 def full_case(config, zero=False):
@@ -183,7 +200,9 @@ def test_weights_are_not_applied():
     params, batch, states, spaces = full_case(small_config())
     plain = world_model.world_model_losses(params, batch, states, spaces, small_config())
     names = ("reconstruction", "reward", "continue", "dynamics", "representation")
-    scaled = world_model.world_model_losses(params, batch, states, spaces, small_config(**{f"{name}_scale": 7.0 for name in names}))
+    scaled = world_model.world_model_losses(
+        params, batch, states, spaces, small_config(**{f"{name}_scale": 7.0 for name in names})
+    )
     assert all(np.array_equal(plain[name], scaled[name]) for name in plain)
 
 
@@ -201,7 +220,9 @@ def test_missing_keys_and_wrong_shapes_are_refused():
     params, batch, states, spaces = full_case(config)
     for key in ("reward", "is_terminal", "x", "view"):
         with pytest.raises(ValueError, match=f"the key '{key}' is missing"):
-            world_model.world_model_losses(params, {name: batch[name] for name in batch if name != key}, states, spaces, config)
+            world_model.world_model_losses(
+                params, {name: batch[name] for name in batch if name != key}, states, spaces, config
+            )
     with pytest.raises(ValueError, match=r"batch reward: expected shape \[2, 3\], got \[2, 3, 1\]"):
         world_model.world_model_losses(params, batch | {"reward": np.zeros((2, 3, 1))}, states, spaces, config)
     with pytest.raises(ValueError, match=r"prior_logits: expected shape \[3, 2, 2\], got \[1, 2, 2\]"):

@@ -33,7 +33,8 @@ def data() -> dict[str, Any]:
     return make()
 
 
-# --- The result --------------------------------------------------------------------------------------------------------------------------
+# --- The result
+# ------------------------------------------------------------------------------
 
 
 def test_the_result_is_plain_and_follows_the_schema(data: dict[str, Any]) -> None:
@@ -75,7 +76,10 @@ def test_our_reading_of_the_schema_is_that_of_jsonschema(data: dict[str, Any]) -
         (spoiled("checks", delete=True), "it lacks 'checks'"),
         (spoiled("extra", value=1), "it must not have 'extra'"),
         (spoiled("checks", FAIL, "share", value="3"), f"it.checks.{FAIL}.share must be of type number or null"),
-        (spoiled("checks", FAIL, "failure", "snippet", value=None), f"it.checks.{FAIL}.failure.snippet must be of type string"),
+        (
+            spoiled("checks", FAIL, "failure", "snippet", value=None),
+            f"it.checks.{FAIL}.failure.snippet must be of type string",
+        ),
         (spoiled("verdict", "problems", value=["a", 1]), "it.verdict.problems[1] must be of type string"),
     ):
         assert not validator.is_valid(wrong)
@@ -99,7 +103,8 @@ def test_only_results_are_read(data: dict[str, Any], tmp_path: Path) -> None:
         read(tmp_path / "absent.json")
 
 
-# --- Failing inputs ----------------------------------------------------------------------------------------------------------------------
+# --- Failing inputs
+# ------------------------------------------------------------------------------
 
 
 def test_the_failing_call_is_told_in_full(data: dict[str, Any]) -> None:
@@ -120,8 +125,11 @@ def test_the_failing_call_is_told_in_full(data: dict[str, Any]) -> None:
 
 
 def test_the_failing_call_is_the_smallest_case() -> None:
-    """Of a property that fails everywhere above 100, the case that hypothesis ends with, and not one of those on the way."""
-    source = "import numpy as np\ndef symlog(x):\n    return np.where(np.abs(x) > 100, 0, np.sign(x) * np.log1p(np.abs(x)))"
+    """Of a property that fails everywhere above 100, the case that hypothesis ends with, and not one of those on the
+    way."""
+    source = (
+        "import numpy as np\ndef symlog(x):\n    return np.where(np.abs(x) > 100, 0, np.sign(x) * np.log1p(np.abs(x)))"
+    )
     result = run_check(CHECKS[PASS], adapter(source), "float64", "paper", examples=100)
     assert result.call is not None
     assert result.call.got is not None
@@ -145,7 +153,9 @@ def test_a_candidate_that_writes_into_its_arguments_hides_nothing() -> None:
     assert run.last_call.arguments[0] is large
 
 
-def test_the_command_and_the_snippet_repeat_the_failure(data: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command_and_the_snippet_repeat_the_failure(
+    data: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     Path("mine.py").write_text(ADAPTER, encoding="utf-8")
     failure = data["checks"][FAIL]["failure"]
@@ -163,7 +173,9 @@ def test_the_command_and_the_snippet_repeat_the_failure(data: dict[str, Any], tm
 
 def test_large_calls_are_made_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    Path("mine.py").write_text("def core(params, deter, stoch, action, config):\n    return deter + 0.5\n", encoding="utf-8")
+    Path("mine.py").write_text(
+        "def core(params, deter, stoch, action, config):\n    return deter + 0.5\n", encoding="utf-8"
+    )
     assert main(["check", "mine.py", "--only", "core_matches", "--examples", "3", "--json", "r.json"]) == 1
     failure = read(Path("r.json"))["checks"]["rssm.core_matches"]["failure"]
     assert failure["arguments"][0]["type"].endswith("numbers")
@@ -228,7 +240,8 @@ def test_a_process_and_an_object_have_snippets() -> None:
     compile(made, "snippet", "exec")
 
 
-# --- What it takes to pass ---------------------------------------------------------------------------------------------------------------
+# --- What it takes to pass
+# ------------------------------------------------------------------------------
 
 
 def run(tmp_path: Path, source: str, *options: str) -> int:
@@ -291,14 +304,20 @@ def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
 
 
 def test_a_requirement_passes_unexpectedly_only_as_a_whole() -> None:
-    results = [run_check(CHECKS[name], adapter(), "float64", "paper", examples=2) for name in (FAIL, "returns.lambda_return_matches", PASS)]
+    results = [
+        run_check(CHECKS[name], adapter(), "float64", "paper", examples=2)
+        for name in (FAIL, "returns.lambda_return_matches", PASS)
+    ]
     assert ExpectedFailures({"RET-1": "x"}).outcome("RET-1", results) == "fail"
     assert ExpectedFailures({"RET-1": "x"}).outcome("RET-1", results[2:]) == "not run"
     assert verdict(settings(), results, ExpectedFailures({"RET-1": "x"})) == {"passed": True, "problems": []}
-    assert verdict(settings(), results[2:], ExpectedFailures({"TRA-3": "x"}))["problems"] == ["TRA-3 passes, and is expected to fail"]
+    assert verdict(settings(), results[2:], ExpectedFailures({"TRA-3": "x"}))["problems"] == [
+        "TRA-3 passes, and is expected to fail"
+    ]
 
 
-# --- Reproducible ------------------------------------------------------------------------------------------------------------------------
+# --- Reproducible
+# ------------------------------------------------------------------------------
 
 
 class Listening:

@@ -29,8 +29,14 @@ def data() -> dict[str, Any]:
 def hostile() -> dict[str, Any]:
     """Every text that an implementation or a file can bring in."""
     made = make(reasons={FAIL: HOSTILE})
-    made["candidate"] = made["device"] = made["implementation"]["name"] = made["implementation"]["edition"] = made["edition"] = HOSTILE
-    made["fit"] = {"editions": [{"edition": HOSTILE, "passed": 1, "judged": 2, "offered": 3}], "alike": [HOSTILE], "better": HOSTILE}
+    made["candidate"] = made["device"] = made["implementation"]["name"] = made["implementation"]["edition"] = made[
+        "edition"
+    ] = HOSTILE
+    made["fit"] = {
+        "editions": [{"edition": HOSTILE, "passed": 1, "judged": 2, "offered": 3}],
+        "alike": [HOSTILE],
+        "better": HOSTILE,
+    }
     made["verdict"]["problems"] = [HOSTILE]
     made["versions"][HOSTILE] = HOSTILE
     made["diagnoses"][0] |= dict.fromkeys(("mutant", "explanation", "provenance", "chapter", "fix"), HOSTILE)
@@ -61,7 +67,8 @@ def test_a_run_prints_its_seed_and_version(data: dict[str, Any]) -> None:
     assert summary.settings({**data, "versions": {"dreamer-spec": "9.9"}}).endswith("dreamer-spec 9.9")
 
 
-# --- The renderings ----------------------------------------------------------------------------------------------------------------------
+# --- The renderings
+# ------------------------------------------------------------------------------
 
 
 def test_the_terminal(data: dict[str, Any]) -> None:
@@ -104,7 +111,11 @@ def test_junit(data: dict[str, Any]) -> None:
     assert data["checks"][FAIL]["failure"]["snippet"] in str(failure.text)
     assert cases[f"conformance.{ERROR}"][0].get("message") == "RuntimeError: out of order"
     suites = {suite.get("name"): suite for suite in root}
-    assert (suites["layers"].get("tests"), suites["layers"].get("errors"), suites["layers"].get("skipped")) == ("2", "1", "1")
+    assert (suites["layers"].get("tests"), suites["layers"].get("errors"), suites["layers"].get("skipped")) == (
+        "2",
+        "1",
+        "1",
+    )
     (seed,) = [entry.get("value") for entry in suites["layers"].iter("property") if entry.get("name") == "seed"]
     assert seed == "3"
 
@@ -150,7 +161,9 @@ def test_the_page_needs_nothing_else(data: dict[str, Any]) -> None:
     (policy,) = [attributes["content"] for _, attributes in document.elements if "http-equiv" in attributes]
     assert policy == "default-src 'none'; style-src 'unsafe-inline'"
     assert not {tag for tag, _ in document.elements} & {"script", "link", "img", "iframe", "object", "form"}
-    assert not [name for _, attributes in document.elements for name in attributes if name.startswith("on") or name == "src"]
+    assert not [
+        name for _, attributes in document.elements for name in attributes if name.startswith("on") or name == "src"
+    ]
     assert "prefers-color-scheme: dark" in document.text
 
 
@@ -188,7 +201,8 @@ def test_what_is_alike_in_several_results_is_told_apart(data: dict[str, Any]) ->
     assert found == ["mine 1.2 float64, paper, a", "mine 1.2 float32, paper", "mine 1.2 float64, paper, c", "mine 1.3"]
 
 
-# --- What fails only with extreme input --------------------------------------------------------------------------------------------------
+# --- What fails only with extreme input
+# ------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -216,7 +230,11 @@ def test_extreme_failures_come_under_a_heading(extreme: dict[str, Any]) -> None:
     for text in (shown(extreme), markdown.render(extreme), Document(html.render([extreme])).text):
         command, heading = extreme["checks"][FAIL]["failure"]["command"], "Only with extreme input"
         assert text.index(extreme["checks"][ERROR]["failure"]["command"]) < text.index(heading) < text.index(command)
-    boxes = [attributes for _, attributes in Document(html.render([extreme])).elements if "failure-0" in str(attributes.get("id"))]
+    boxes = [
+        attributes
+        for _, attributes in Document(html.render([extreme])).elements
+        if "failure-0" in str(attributes.get("id"))
+    ]
     assert {box["id"]: "open" in box for box in boxes} == {f"failure-0-{ERROR}": True, f"failure-0-{FAIL}": False}
 
 
@@ -236,12 +254,16 @@ def test_a_traceback_comes_last_and_folded(data: dict[str, Any]) -> None:
     assert page.index("See it again") < page.index("<details><summary>Traceback</summary><pre>Traceback")
 
 
-# --- What was not judged -----------------------------------------------------------------------------------------------------------------
+# --- What was not judged
+# ------------------------------------------------------------------------------
 
 
 def test_offered_but_not_checked() -> None:
     made = adapter("def mse_loss(prediction, target): ...\ndef symlog(x): return x")
-    results = [run_check(CHECKS[name], made, "float64", "paper", examples=1) for name in ("distributions.squared_errors_match", PASS)]
+    results = [
+        run_check(CHECKS[name], made, "float64", "paper", examples=1)
+        for name in ("distributions.squared_errors_match", PASS)
+    ]
     assert offered(made) == ["symlog", "mse_loss"]
     assert unchecked(offered(made), results) == [{"function": "mse_loss", "needs": ["symlog_mse_loss"]}]
     data = {**make(), "unchecked": unchecked(offered(made), results)}
@@ -254,7 +276,11 @@ def test_offered_but_not_checked() -> None:
 def test_what_is_not_implemented_is_told_once() -> None:
     data = make()
     for name in ("transforms.symlog_matches", "transforms.symexp_matches"):
-        data["checks"][name] = {**data["checks"][PASS], "status": "not offered", "message": "not implemented: symlog (negative numbers)"}
+        data["checks"][name] = {
+            **data["checks"][PASS],
+            "status": "not offered",
+            "message": "not implemented: symlog (negative numbers)",
+        }
     line = "Not implemented, as the candidate says: symlog (negative numbers)."
     assert shown(data).count(line) == 1
     assert line in Document(html.render([data])).text
@@ -268,9 +294,15 @@ def test_cells_say_what_was_not_offered(data: dict[str, Any]) -> None:
 
 
 def test_formulas_are_plain_text() -> None:
-    text = r"`a$b$` is $16 \delta (1 + \lvert x \rvert)$, $p_{c+j} \ge 10^{-12}$, $\mathrm{sg}(x_0)$ and $\frac{1}{2} \sqrt{n}$"
+    text = (
+        r"`a$b$` is $16 \delta (1 + \lvert x \rvert)$, $p_{c+j} \ge 10^{-12}$, "
+        r"$\mathrm{sg}(x_0)$ and $\frac{1}{2} \sqrt{n}$"
+    )
     assert tex.plain(text) == "`a$b$` is 16 δ (1 + |x|), p_(c+j) ≥ 10⁻¹², sg(x₀) and 1/2 √n"
-    assert html.prose("**[X-1]** a `b*c*` *d* $e < 2 * f * g$") == "<b>[X-1]</b> a <code>b*c*</code> <i>d</i> e &lt; 2 * f * g"
+    assert (
+        html.prose("**[X-1]** a `b*c*` *d* $e < 2 * f * g$")
+        == "<b>[X-1]</b> a <code>b*c*</code> <i>d</i> e &lt; 2 * f * g"
+    )
 
 
 def test_no_requirement_is_cut_or_shows_tex() -> None:
@@ -279,7 +311,9 @@ def test_no_requirement_is_cut_or_shows_tex() -> None:
         assert not re.search(r"\$|\\[a-z]", re.sub("`[^`]*`", "", tex.plain(text))), identifier
 
 
-def test_chapters_are_linked_where_the_repository_is_known(data: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_chapters_are_linked_where_the_repository_is_known(
+    data: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(summary, "repository", lambda: "https://example.org/dreamer-spec")
     address = "https://example.org/dreamer-spec/blob/main/spec/07-returns.md"
     assert f'<a href="{address}">07 Returns</a>' in html.render([data])

@@ -24,7 +24,7 @@ MAY_IMPORT = {
     "impl_jax": {"spec"},
     "impl_torch": {"spec"},
     "conformance": {"spec", "reference_numpy"},
-    "train": {"spec", "reference_numpy", "conformance"},
+    "dreamer_spec": {"spec", "reference_numpy", "conformance"},
 }
 ADAPTERS = {"jax_adapter.py": "impl_jax", "torch_adapter.py": "impl_torch"}
 
@@ -32,7 +32,9 @@ ADAPTERS = {"jax_adapter.py": "impl_jax", "torch_adapter.py": "impl_torch"}
 def public_functions(row: str) -> list[tuple[str, object]]:
     module = importlib.import_module(f"reference_numpy.{row}")
     members = inspect.getmembers(module, lambda member: inspect.isfunction(member) or inspect.isclass(member))
-    return [(name, member) for name, member in members if member.__module__ == module.__name__ and not name.startswith("_")]
+    return [
+        (name, member) for name, member in members if member.__module__ == module.__name__ and not name.startswith("_")
+    ]
 
 
 @pytest.mark.parametrize("row", [*ROWS, *SHARED_ROWS, "stop_gradient"])
@@ -42,12 +44,18 @@ def test_every_public_function_of_the_reference_cites_its_requirements(row: str)
     for name, function in functions:
         cited = set(re.findall(r"\[([A-Z]{2,6}-\d+)\]", inspect.getdoc(function) or ""))
         assert cited, f"{row}.{name} cites no requirement"
-        assert cited <= set(requirements()), f"{row}.{name} cites {sorted(cited - set(requirements()))}, which no chapter has"
+        assert cited <= set(requirements()), (
+            f"{row}.{name} cites {sorted(cited - set(requirements()))}, which no chapter has"
+        )
 
 
 def test_every_cited_requirement_exists() -> None:
     for path in [*ROOT.glob("spec/*.md"), *ROOT.glob("*/*.py"), *ROOT.glob("conformance/*/*.py")]:
-        cited = set(re.findall(r"\[((?:CON|TRA|DIS|LAY|RSSM|NET|WM|RET|BEH|OPT|AGT|REP|LOOP)-\d+)\]", path.read_text(encoding="utf-8")))
+        cited = set(
+            re.findall(
+                r"\[((?:CON|TRA|DIS|LAY|RSSM|NET|WM|RET|BEH|OPT|AGT|REP|LOOP)-\d+)\]", path.read_text(encoding="utf-8")
+            )
+        )
         assert cited <= set(requirements()), f"{path.name} cites {sorted(cited - set(requirements()))}"
 
 
@@ -64,7 +72,9 @@ def test_every_decision_is_there() -> None:
 
 
 def test_cited_decisions_exist() -> None:
-    known = set(re.findall(r"^### ([DE]-\d+)", (ROOT / "spec" / "decisions.md").read_text(encoding="utf-8"), re.MULTILINE))
+    known = set(
+        re.findall(r"^### ([DE]-\d+)", (ROOT / "spec" / "decisions.md").read_text(encoding="utf-8"), re.MULTILINE)
+    )
     for path in [*ROOT.glob("spec/*.md"), *ROOT.glob("spec/*.toml"), *ROOT.glob("*/*.py")]:
         cited = set(re.findall(r"\b([DE]-\d{2,3})\b", path.read_text(encoding="utf-8")))
         assert cited <= known, f"{path.name} cites {sorted(cited - known)}"
@@ -95,7 +105,9 @@ def test_dependencies_point_one_way(package: str) -> None:
 
 
 def test_nothing_is_unpickled() -> None:
-    forbidden = re.compile(r"import pickle|pickle\.loads?|allow_pickle\s*=\s*True|weights_only\s*=\s*False|torch\.load\(")
+    forbidden = re.compile(
+        r"import pickle|pickle\.loads?|allow_pickle\s*=\s*True|weights_only\s*=\s*False|torch\.load\("
+    )
     for folder in (*MAY_IMPORT, "tests", "docs", "benchmarks"):
         for path in (ROOT / folder).rglob("*.py"):
             if path.name != Path(__file__).name:

@@ -5,7 +5,18 @@ import pytest
 from reference_numpy.replay import Replay
 from spec import Discrete, Spaces, Vector
 
-RESERVED = ["reward", "continue_", "is_first", "is_last", "is_terminal", "action", "prev_action", "deter", "stoch", "ids"]
+RESERVED = [
+    "reward",
+    "continue_",
+    "is_first",
+    "is_last",
+    "is_terminal",
+    "action",
+    "prev_action",
+    "deter",
+    "stoch",
+    "ids",
+]
 
 
 @pytest.mark.parametrize("key", RESERVED)

@@ -67,7 +67,8 @@ def test_the_number_of_tests_is_right(name: str, monkeypatch: pytest.MonkeyPatch
 
 
 def test_right_samplers_raise_fewer_alarms_than_stated(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With an allowed rate of 1/2 per run: 4 checks of 12 seeds alarm less often than in half of the runs, and at 1e-6 never."""
+    """With an allowed rate of 1/2 per run: 4 checks of 12 seeds alarm less often than in half of the runs, and at 1e-6
+    never."""
     adapter = NumpyAdapter()
     alarms = {0.5: 0, 1e-6: 0}
     for rate in alarms:
@@ -79,12 +80,16 @@ def test_right_samplers_raise_fewer_alarms_than_stated(monkeypatch: pytest.Monke
 
 
 def test_the_radii_hold_and_are_not_wide() -> None:
-    """At a level of 1/10 each radius is exceeded in at most 10 % of 4,000 experiments; half of the radius is exceeded often."""
+    """At a level of 1/10 each radius is exceeded in at most 10 % of 4,000 experiments; half of the radius is exceeded
+    often."""
     rng, n, trials, level = np.random.default_rng(0), 400, 4000, math.log(20)
     normals, uniforms = rng.normal(size=(trials, n)), rng.random((trials, n))
     distances = np.array([distribution_distance(row, lambda x: x) for row in uniforms[:1000]])
     experiments = {
-        "frequency": (np.abs(rng.binomial(n, 0.02, trials) / n - 0.02), float(frequency_radius(np.array(0.02), n, level))),
+        "frequency": (
+            np.abs(rng.binomial(n, 0.02, trials) / n - 0.02),
+            float(frequency_radius(np.array(0.02), n, level)),
+        ),
         "mean": (np.abs(uniforms.mean(1) - 0.5), float(mean_radius(1 / 12, 0.5, n, level))),
         "normal mean": (np.abs(normals.mean(1)), normal_mean_radius(n, level)),
         "normal square": (np.abs(np.mean(normals**2, 1) - 1), normal_square_radius(n, level)),
@@ -98,7 +103,9 @@ def test_the_radii_hold_and_are_not_wide() -> None:
 def test_the_distance_of_distributions() -> None:
     """Of the samples 0.1, 0.4 and 0.8 from the uniform distribution: largest just after 0.4, 2/3 - 0.4."""
     assert distribution_distance(np.array([0.8, 0.1, 0.4]), lambda x: x) == pytest.approx(2 / 3 - 0.4)
-    np.testing.assert_allclose(normal_cdf(np.array([-40.0, -1.0, 0.0, 1.959964])), [0, 0.15865525, 0.5, 0.975], atol=1e-8)
+    np.testing.assert_allclose(
+        normal_cdf(np.array([-40.0, -1.0, 0.0, 1.959964])), [0, 0.15865525, 0.5, 0.975], atol=1e-8
+    )
 
 
 def softmax(logits: np.ndarray, unimix: float) -> np.ndarray:
@@ -117,10 +124,18 @@ CATEGORICAL_MISTAKES = {
         softmax(np.log(softmax(logits, unimix)), unimix), rng.random((n, len(logits)))
     ),
     "the most likely class": lambda logits, unimix, rng, n: np.tile(logits.argmax(-1), (n, 1)),
-    "one number for all latents": lambda logits, unimix, rng, n: inverse(softmax(logits, unimix), np.tile(rng.random((n, 1)), len(logits))),
-    "one sample n times": lambda logits, unimix, rng, n: np.tile(inverse(softmax(logits, unimix), rng.random((1, len(logits)))), (n, 1)),
-    "a temperature": lambda logits, unimix, rng, n: inverse(softmax(1.1 * logits, unimix), rng.random((n, len(logits)))),
-    "probabilities as logits": lambda logits, unimix, rng, n: inverse(softmax(softmax(logits, unimix), 0), rng.random((n, len(logits)))),
+    "one number for all latents": lambda logits, unimix, rng, n: inverse(
+        softmax(logits, unimix), np.tile(rng.random((n, 1)), len(logits))
+    ),
+    "one sample n times": lambda logits, unimix, rng, n: np.tile(
+        inverse(softmax(logits, unimix), rng.random((1, len(logits)))), (n, 1)
+    ),
+    "a temperature": lambda logits, unimix, rng, n: inverse(
+        softmax(1.1 * logits, unimix), rng.random((n, len(logits)))
+    ),
+    "probabilities as logits": lambda logits, unimix, rng, n: inverse(
+        softmax(softmax(logits, unimix), 0), rng.random((n, len(logits)))
+    ),
 }
 
 
@@ -131,7 +146,9 @@ def test_mistakes_with_categoricals(mistake: str | None) -> None:
         right = inverse(softmax(logits, unimix), rng.random((n, len(logits))))
         return np.eye(logits.shape[1])[CATEGORICAL_MISTAKES[mistake](logits, unimix, rng, n) if mistake else right]
 
-    assert status("latents_have_their_frequencies", offering(draw_categorical=draw))[0] == ("fail" if mistake else "pass")
+    assert status("latents_have_their_frequencies", offering(draw_categorical=draw))[0] == (
+        "fail" if mistake else "pass"
+    )
 
 
 def test_a_seed_that_is_not_used() -> None:
@@ -164,7 +181,9 @@ def test_mistakes_with_normals(mistake: str | None) -> None:
 ACTION_MISTAKES = {
     "clipped": lambda actions, outputs: np.clip(actions, -1, 1),
     "squashed": lambda actions, outputs: np.concatenate([np.tanh(actions[:, :2]), actions[:, 2:]], 1),
-    "the mean": lambda actions, outputs: np.concatenate([np.tile(np.tanh(outputs["arm"]["mean"]), (len(actions), 1)), actions[:, 2:]], 1),
+    "the mean": lambda actions, outputs: np.concatenate(
+        [np.tile(np.tanh(outputs["arm"]["mean"]), (len(actions), 1)), actions[:, 2:]], 1
+    ),
     "the keys in another order": lambda actions, outputs: np.concatenate([actions[:, 2:], actions[:, :2]], 1),
     "the buttons in another order": lambda actions, outputs: actions[:, [0, 1, 4, 5, 6, 2, 3]],
 }
@@ -205,14 +224,22 @@ def average_fan(entry: Any) -> float:
 
 
 INITIALIZER_MISTAKES = {
-    "clipped": lambda entry, rng: np.clip(rng.normal(size=entry.shape), -2, 2) * entry.outscale / math.sqrt(entry.fan_in),
+    "clipped": lambda entry, rng: (
+        np.clip(rng.normal(size=entry.shape), -2, 2) * entry.outscale / math.sqrt(entry.fan_in)
+    ),
     "not truncated": lambda entry, rng: rng.normal(size=entry.shape) * entry.outscale / math.sqrt(entry.fan_in),
     "truncated at 2 of any size": lambda entry, rng: np.clip(
         rng.normal(size=entry.shape) * entry.outscale / math.sqrt(entry.fan_in), -2, 2
     ),
-    "no correction of the deviation": lambda entry, rng: truncated(rng, entry.shape) * entry.outscale / math.sqrt(entry.fan_in),
-    "uniform": lambda entry, rng: rng.uniform(-1, 1, entry.shape) * math.sqrt(3) * entry.outscale / math.sqrt(entry.fan_in),
-    "the fan of one block": lambda entry, rng: right(entry, rng) * (math.sqrt(entry.shape[0]) if len(entry.shape) == 3 else 1),
+    "no correction of the deviation": lambda entry, rng: (
+        truncated(rng, entry.shape) * entry.outscale / math.sqrt(entry.fan_in)
+    ),
+    "uniform": lambda entry, rng: (
+        rng.uniform(-1, 1, entry.shape) * math.sqrt(3) * entry.outscale / math.sqrt(entry.fan_in)
+    ),
+    "the fan of one block": lambda entry, rng: (
+        right(entry, rng) * (math.sqrt(entry.shape[0]) if len(entry.shape) == 3 else 1)
+    ),
     "the mean of both fans": lambda entry, rng: right(entry, rng) * math.sqrt(entry.fan_in / average_fan(entry)),
     "no outscale": lambda entry, rng: right(dataclasses.replace(entry, outscale=1.0), rng),
     "zeros": lambda entry, rng: np.zeros(entry.shape),
@@ -226,8 +253,12 @@ def test_mistakes_with_parameters(mistake: str | None) -> None:
         kernel = INITIALIZER_MISTAKES[mistake] if mistake else right
         table = parameter_table(config, task)
         return {
-            name: np.full(entry.shape, constants[entry.initializer]) if entry.initializer in constants else kernel(entry, rng)
+            name: np.full(entry.shape, constants[entry.initializer])
+            if entry.initializer in constants
+            else kernel(entry, rng)
             for name, entry in table.items()
         }
 
-    assert status("parameters_have_their_distribution", offering(draw_parameters=draw))[0] == ("fail" if mistake else "pass")
+    assert status("parameters_have_their_distribution", offering(draw_parameters=draw))[0] == (
+        "fail" if mistake else "pass"
+    )

@@ -1,4 +1,5 @@
-"""The adapters for packages of others: the checks pass and fail as docs/strangers.md says, for the reasons that it gives."""
+"""The adapters for packages of others: the checks pass and fail as docs/strangers.md says, for the reasons that it
+gives."""
 
 import sys
 from pathlib import Path
@@ -18,7 +19,9 @@ MODULES = {"di_engine": "ding", "rllib": "ray", "sheeprl_v3_5": "sheeprl"}  # th
 FEW, MANY = 10, 250  # cases of a property
 SLOW = {"equinox", "haiku"}  # JAX compiles each layer of each shape
 BESIDE_US = [
-    pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name, result in strangers().items() if result["door"] == "module"
+    pytest.param(name, marks=pytest.mark.slow if name in SLOW else ())
+    for name, result in strangers().items()
+    if result["door"] == "module"
 ]
 ALONE = [name for name, result in strangers().items() if result["door"] == "process"]
 SCRIPTS = [
@@ -51,8 +54,8 @@ def failing_checks(adapter: object, result: dict[str, Any], names: set[str], exa
 
 @pytest.mark.parametrize("name", BESIDE_US)
 def test_the_kit_finds_what_is_recorded(name: str) -> None:
-    """What fails in a few cases has failed in the many of the record; what has failed there and not here fails in very many: which
-    cases are drawn depends on the code, and some deviations are rare."""
+    """What fails in a few cases has failed in the many of the record; what has failed there and not here fails in very
+    many: which cases are drawn depends on the code, and some deviations are rare."""
     version, result = recorded_version(name), strangers()[name]
     recorded = set(failing(result))
     with candidate(str(EXAMPLES / f"{name}_adapter.py"), None, result["dtype"], None, 60) as adapter:
@@ -70,11 +73,15 @@ def test_the_kit_finds_what_is_recorded_through_a_process(name: str) -> None:
     """Each of these needs an environment of its own, with this project beside it: docs/strangers.md says which."""
     pytest.importorskip(MODULES.get(name, name))
     result = strangers()[name]
-    with candidate(None, f"{sys.executable} {SERVE} {EXAMPLES / f'{name}_adapter.py'}", result["dtype"], None, 300) as adapter:
+    with candidate(
+        None, f"{sys.executable} {SERVE} {EXAMPLES / f'{name}_adapter.py'}", result["dtype"], None, 300
+    ) as adapter:
         if adapter.version != result["version"]:
             pytest.skip(f"recorded with {name} {result['version']}, installed is {adapter.version}")
         found = run_checks(adapter, result, set(result["checks"]), result["examples"])
-    assert {run.check.name: run.status for run in found} == {check: entry["status"] for check, entry in result["checks"].items()}
+    assert {run.check.name: run.status for run in found} == {
+        check: entry["status"] for check, entry in result["checks"].items()
+    }
 
 
 @pytest.mark.parametrize("name", strangers())
@@ -99,10 +106,28 @@ def test_the_calculations_by_hand(package: str, script: str) -> None:
 
 
 def test_a_result_is_reduced_to_what_is_shown() -> None:
-    passed: dict[str, Any] = {"status": "pass", "requirements": ["TRA-3"], "compared": 7, "message": "", "level": 0, "extreme": False}
-    error = "Traceback (most recent call last):\n  File x\nTypeError: no\n--------------------\nFor simplicity, JAX has removed frames."
+    passed: dict[str, Any] = {
+        "status": "pass",
+        "requirements": ["TRA-3"],
+        "compared": 7,
+        "message": "",
+        "level": 0,
+        "extreme": False,
+    }
+    error = (
+        "Traceback (most recent call last):\n  File x\nTypeError: "
+        "no\n--------------------\nFor simplicity, JAX has removed frames."
+    )
     result = {
-        **{"date": "2026-01-31", "process": False, "dtype": "float64", "edition": "2023", "choice": "claimed", "seed": 0, "examples": 25},
+        **{
+            "date": "2026-01-31",
+            "process": False,
+            "dtype": "float64",
+            "edition": "2023",
+            "choice": "claimed",
+            "seed": 0,
+            "examples": 25,
+        },
         "versions": {},
         "implementation": {"name": "their_adapter", "version": "1.2", "edition": None},
         "checks": {
@@ -110,15 +135,28 @@ def test_a_result_is_reduced_to_what_is_shown() -> None:
             "bad": passed | {"status": "fail", "message": "got 1, expected 2\nFailing test case"},
             "raised": passed | {"status": "error", "message": error},
             "missing": passed | {"status": "not offered", "message": "the adapter does not offer symlog"},
-            "other": passed | {"status": "not in edition", "message": "2023 has OPT-8 otherwise, which is not modelled here"},
+            "other": passed
+            | {"status": "not in edition", "message": "2023 has OPT-8 otherwise, which is not modelled here"},
         },
         "diagnoses": [{"mutant": "m", "explained": ["bad"], "fix": "f"}],
     }
     kept = reduce("theirs", result)
     assert kept["checks"] == {
         "good": {"status": "pass", "requirements": ["TRA-3"], "compared": 7, "extreme": False},
-        "bad": {"status": "fail", "requirements": ["TRA-3"], "compared": 7, "extreme": False, "message": "got 1, expected 2"},
-        "raised": {"status": "error", "requirements": ["TRA-3"], "compared": 7, "extreme": False, "message": "TypeError: no"},
+        "bad": {
+            "status": "fail",
+            "requirements": ["TRA-3"],
+            "compared": 7,
+            "extreme": False,
+            "message": "got 1, expected 2",
+        },
+        "raised": {
+            "status": "error",
+            "requirements": ["TRA-3"],
+            "compared": 7,
+            "extreme": False,
+            "message": "TypeError: no",
+        },
     }
     assert (kept["package"], kept["version"], kept["door"]) == ("theirs", "1.2", "module")
     assert (kept["not_offered"], kept["not_judged"]) == (1, 1)

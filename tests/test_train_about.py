@@ -8,12 +8,12 @@ from typing import Any
 import pytest
 
 from conformance.preflight import Comparison, Report
+from dreamer_spec.about import command_line, nearest, read_about, write_about
+from dreamer_spec.cli import build_parser, parse
+from dreamer_spec.errors import UserError
+from dreamer_spec.machine import describe
+from dreamer_spec.options import Options, make_options, presets
 from spec import Discrete, Spaces, Vector, hyperparameters, load_config
-from train.about import command_line, nearest, read_about, write_about
-from train.cli import build_parser, parse
-from train.errors import UserError
-from train.machine import describe
-from train.options import Options, make_options, presets
 
 SPACES = Spaces({"observation": Vector(4)}, {"action": Discrete((2,))})
 
@@ -33,9 +33,19 @@ def test_the_command_of_every_preset_gives_its_options(preset: str, tmp_path: Pa
 
 
 def test_the_command_gives_every_option() -> None:
-    """Every option of `train` is given a value that it does not have by itself, so one that the command forgets fails here."""
+    """Every option of `train` is given a value that it does not have by itself, so one that the command forgets fails
+    here."""
     plain = make_options("jax", {"task": "my module:make_env"}, {})
-    words = ["--task", "my module:make_env", "--learning-rate", "3e-5", "--cnn-multipliers", "2,2,4,4", "--cnn-outer", "false"]
+    words = [
+        "--task",
+        "my module:make_env",
+        "--learning-rate",
+        "3e-5",
+        "--cnn-multipliers",
+        "2,2,4,4",
+        "--cnn-outer",
+        "false",
+    ]
     for action in build_parser()._actions:
         if action.dest in ("help", "version", "preset", "task", "seeds") or action.dest in hyperparameters():
             continue
@@ -45,28 +55,43 @@ def test_the_command_gives_every_option() -> None:
             unusual = [choice for choice in action.choices or [seven] if choice != getattr(plain, action.dest, "12m")]
             words.append(unusual[-1])
     options = parse(words)
-    same = [field.name for field in dataclasses.fields(options) if getattr(options, field.name) == getattr(plain, field.name)]
+    same = [
+        field.name
+        for field in dataclasses.fields(options)
+        if getattr(options, field.name) == getattr(plain, field.name)
+    ]
     assert same == ["task"]
     assert parse(command_line(options)[1:]) == options
 
 
 def test_profile_and_size_are_found_again() -> None:
     assert nearest(load_config("official", "50m")) == ("official", "50m", {})
-    assert nearest(load_config("paper", "tiny", learning_rate=1e-3, envs=2)) == ("paper", "tiny", {"learning_rate": 1e-3, "envs": 2})
+    assert nearest(load_config("paper", "tiny", learning_rate=1e-3, envs=2)) == (
+        "paper",
+        "tiny",
+        {"learning_rate": 1e-3, "envs": 2},
+    )
 
 
 def test_run_json_says_everything(tmp_path: Path) -> None:
     options = make_options("jax", {"logdir": tmp_path, "seed": 5}, {})
     about = write(options)
     assert json.loads((tmp_path / "run.json").read_text()) == about == read_about(tmp_path)
-    assert (about["task"], about["profile"], about["size"], about["parameters"]) == ("gym:CartPole-v1", "paper", "tiny", 123)
+    assert (about["task"], about["profile"], about["size"], about["parameters"]) == (
+        "gym:CartPole-v1",
+        "paper",
+        "tiny",
+        123,
+    )
     assert about["options"]["seed"] == 5
     assert about["hyperparameters"]["batch_length"] == 32
     assert about["changed_hyperparameters"]["batch_length"] == 32
     comparison = {"name": "encoder", "requirements": ["NET-2"], "share": 0.25}
     assert about["preflight"] == {"passed": True, "worst": 1e-7, "summary": "all agree", "comparisons": [comparison]}
     assert about["spaces"]["actions"] == {"action": {"kind": "discrete", "classes": [2]}}
-    assert {"processor", "cores", "memory_gib", "system", "accelerator", "python", "versions", "commit"} <= about["machine"].keys()
+    assert {"processor", "cores", "memory_gib", "system", "accelerator", "python", "versions", "commit"} <= about[
+        "machine"
+    ].keys()
     assert about["machine"]["versions"]["numpy"]
     assert [start["step"] for start in about["starts"]] == [0]
     assert not list(tmp_path.glob("*.tmp"))
@@ -84,7 +109,9 @@ def test_a_resumed_run_appends_its_start(tmp_path: Path) -> None:
     assert len(new["starts"]) == 1
 
 
-@pytest.mark.parametrize("content", ["", "[]", '{"format": 99}', "[" * 100_000, '{"format": 1}', '{"format": 1, "id": 2, "starts": 3}'])
+@pytest.mark.parametrize(
+    "content", ["", "[]", '{"format": 99}', "[" * 100_000, '{"format": 1}', '{"format": 1, "id": 2, "starts": 3}']
+)
 def test_a_damaged_run_json_does_not_stop_a_resume(tmp_path: Path, content: str) -> None:
     (tmp_path / "run.json").write_text(content)
     assert (read_about(tmp_path) is None) is ('"format": 1' not in content)
@@ -111,5 +138,5 @@ def test_the_commit_is_that_of_this_code(tmp_path: Path, monkeypatch: pytest.Mon
     here = describe()["commit"]
     monkeypatch.chdir(tmp_path)
     assert describe()["commit"] == here
-    monkeypatch.setattr("train.machine.ROOT", tmp_path)
+    monkeypatch.setattr("dreamer_spec.machine.ROOT", tmp_path)
     assert describe()["commit"] is None

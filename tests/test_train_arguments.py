@@ -12,19 +12,19 @@ from train_agents import save_checkpoint
 from train_fakes import EPISODE, FakeLearner
 from train_runs import Make, logged
 
-import train.setup
+import dreamer_spec.setup
+from dreamer_spec import about, arguments, loop
+from dreamer_spec.checkpoint import open_checkpoint
+from dreamer_spec.cli import main, parse
+from dreamer_spec.envs import ContractEnv, make_env
+from dreamer_spec.envs.failure import Failure
+from dreamer_spec.envs.trial import make_here
+from dreamer_spec.errors import UserError
+from dreamer_spec.policy import Policy, save
+from dreamer_spec.report.page import render
+from dreamer_spec.report.runs import read_run
+from dreamer_spec.saved_agent import agent_of, check_info
 from spec import Config, Discrete, Spaces, Vector, load_config
-from train import about, arguments, loop
-from train.checkpoint import open_checkpoint
-from train.cli import main, parse
-from train.envs import ContractEnv, make_env
-from train.envs.failure import Failure
-from train.envs.trial import make_here
-from train.errors import UserError
-from train.policy import Policy, save
-from train.report.page import render
-from train.report.runs import read_run
-from train.saved_agent import agent_of, check_info
 
 VALUES = [
     *(0, -3, 2**63 - 1, 0.5, True, None, "", "8x8", "a=b", "1", "true", '"quoted"', "[1", "NaN", "9" * 30),
@@ -92,7 +92,14 @@ def test_what_is_written_is_read_again(value: Any) -> None:
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        *(("a=3", 3), ("a=8x8", "8x8"), ("a=[1, 2]", [1, 2]), ("a=false", False), ("a=False", "False"), ("a=null", None)),
+        *(
+            ("a=3", 3),
+            ("a=8x8", "8x8"),
+            ("a=[1, 2]", [1, 2]),
+            ("a=false", False),
+            ("a=False", "False"),
+            ("a=null", None),
+        ),
         *(("a=", ""), ("a=x=y", "x=y"), ('a="3"', "3"), ("a=NaN", "NaN"), ("a=1e3", 1000.0)),
     ],
 )
@@ -123,7 +130,11 @@ def test_words_that_cannot_be_used_are_named(words: list[str], said: str) -> Non
 
 
 def test_the_command_of_a_run_repeats_them(tmp_path: Path) -> None:
-    words = [word for text in arguments.write({f"v{i}": value for i, value in enumerate(VALUES)}) for word in ("--env-arg", text)]
+    words = [
+        word
+        for text in arguments.write({f"v{i}": value for i, value in enumerate(VALUES)})
+        for word in ("--env-arg", text)
+    ]
     options = parse(["--backend", "jax", "--task", TASK, "--time-limit", "20", *words])
     assert dict(options.env_arg) == {f"v{i}": value for i, value in enumerate(VALUES)}
     assert options.time_limit == 20
@@ -136,7 +147,9 @@ def test_the_command_of_a_run_repeats_them(tmp_path: Path) -> None:
 def test_keyword_arguments_reach_the_environment() -> None:
     make_env(TASK, arguments={"size": 5, "name": "other"})
     assert Adjustable.made == [{"size": 5, "name": "other"}]
-    assert make_env("gym:FrozenLake-v1", arguments={"map_name": "8x8"}).spaces.observations == {"observation": Discrete((64,))}
+    assert make_env("gym:FrozenLake-v1", arguments={"map_name": "8x8"}).spaces.observations == {
+        "observation": Discrete((64,))
+    }
 
 
 @pytest.mark.parametrize(
@@ -246,11 +259,13 @@ CONFIG: Config = load_config("paper", "tiny", compute_dtype="float32", envs=1)
 def test_evaluation_uses_those_of_the_checkpoint_or_others(
     words: list[str], made: dict[str, Any], length: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(train.setup, "learner_class", lambda backend: FakeLearner)
+    monkeypatch.setattr(dreamer_spec.setup, "learner_class", lambda backend: FakeLearner)
     monkeypatch.setattr(FakeLearner, "load_state_dict", lambda self, state: None)
     known = make_env(TASK).translation
     arguments = {"size": 3, "name": "saved"}
-    checkpoint = save_checkpoint(tmp_path, CONFIG, SPACES, translation=known, task=TASK, env_arg=arguments, time_limit=5)
+    checkpoint = save_checkpoint(
+        tmp_path, CONFIG, SPACES, translation=known, task=TASK, env_arg=arguments, time_limit=5
+    )
     Adjustable.made.clear()
     assert main(["eval", str(checkpoint), "--episodes", "1", "--json", str(tmp_path / "out.json"), *words]) == 0
     assert all(entry == made for entry in Adjustable.made)
@@ -260,10 +275,12 @@ def test_evaluation_uses_those_of_the_checkpoint_or_others(
 
 
 def test_another_task_has_arguments_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(train.setup, "learner_class", lambda backend: FakeLearner)
+    monkeypatch.setattr(dreamer_spec.setup, "learner_class", lambda backend: FakeLearner)
     monkeypatch.setattr(FakeLearner, "load_state_dict", lambda self, state: None)
     known = make_env(TASK).translation
-    checkpoint = save_checkpoint(tmp_path, CONFIG, SPACES, translation=known, task=TASK, env_arg={"size": 3}, time_limit=2)
+    checkpoint = save_checkpoint(
+        tmp_path, CONFIG, SPACES, translation=known, task=TASK, env_arg={"size": 3}, time_limit=2
+    )
     arguments = ["eval", str(checkpoint), "--episodes", "1", "--json", str(tmp_path / "out.json")]
     assert main([*arguments, "--task", "train_fakes:Counting"]) == 0
     result = json.loads((tmp_path / "out.json").read_text())
@@ -277,9 +294,19 @@ def test_a_policy_says_them(tmp_path: Path) -> None:
     assert (info["env_arg"], info["time_limit"]) == ({"size": 3}, 5)
 
 
-@pytest.mark.parametrize(("name", "value"), [("env_arg", [1]), ("env_arg", {"a b": 1}), ("time_limit", 0), ("time_limit", "7")])
+@pytest.mark.parametrize(
+    ("name", "value"), [("env_arg", [1]), ("env_arg", {"a b": 1}), ("time_limit", 0), ("time_limit", "7")]
+)
 def test_a_checkpoint_that_says_something_else_is_refused(name: str, value: Any, tmp_path: Path) -> None:
-    info = {"task": "a:b", "step": 0, "backend": "jax", "action_repeat": 1, "image_size": 64, "source": {}, "versions": {}}
+    info = {
+        "task": "a:b",
+        "step": 0,
+        "backend": "jax",
+        "action_repeat": 1,
+        "image_size": 64,
+        "source": {},
+        "versions": {},
+    }
     check_info({**info, "env_arg": {}, "time_limit": None}, SPACES)
     with pytest.raises(ValueError, match=name if name == "time_limit" else "env_arg|keyword arguments"):
         check_info({**info, "env_arg": {}, "time_limit": None, name: value}, SPACES)

@@ -15,10 +15,10 @@ import pytest
 from train_fakes import EPISODE, FakeLearner
 from train_runs import Make, batches, logged, run_quietly, stored
 
+from dreamer_spec import checkpoint, files, loop, setup
+from dreamer_spec.errors import UserError
+from dreamer_spec.resume import save
 from reference_numpy.training_loop import derive_seed
-from train import checkpoint, files, loop, setup
-from train.errors import UserError
-from train.resume import save
 
 # Checkpoints
 
@@ -64,7 +64,8 @@ def test_seeds_are_those_of_the_chapter_and_go_on_after_a_resume(make: Make) -> 
 
 
 def test_a_resumed_run_meets_new_episodes(make: Make) -> None:
-    """Where its environments are not restored, they have seeds of their own: they do not begin as those of the first start did."""
+    """Where its environments are not restored, they have seeds of their own: they do not begin as those of the first
+    start did."""
     options = make(task="gym:CartPole-v1", steps=40, replay_ratio=0, restore_envs=False)
     loop.run(options, FakeLearner)
     streams = stored(run_quietly(dataclasses.replace(options, steps=80)))
@@ -73,7 +74,9 @@ def test_a_resumed_run_meets_new_episodes(make: Make) -> None:
 
 
 @pytest.mark.covers("LOOP-21", "LOOP-23")
-def test_a_run_whose_environments_are_restored_continues_exactly(make: Make, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_whose_environments_are_restored_continues_exactly(
+    make: Make, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Streams, latents (the fake's carry counts steps), episodes and their scores are those of a run in one go."""
     options = make(task="gym:CartPole-v1", steps=46)
     whole = run_quietly(dataclasses.replace(options, steps=92, logdir=options.logdir / "whole"))
@@ -153,7 +156,10 @@ def test_other_spaces_are_refused(make: Make) -> None:
     loop.run(make(), FakeLearner)
     saved = checkpoint.open_checkpoint(make().logdir)
     assert saved
-    spaces = {"observations": {"observation": {"kind": "vector", "size": 3}}, "actions": saved.info["spaces"]["actions"]}
+    spaces = {
+        "observations": {"observation": {"kind": "vector", "size": 3}},
+        "actions": saved.info["spaces"]["actions"],
+    }
     with pytest.raises(UserError, match=r'observations observation: {"kind": "vector", "size": 2} in the checkpoint'):
         checkpoint.require_same_spaces(saved, spaces)
 
@@ -186,7 +192,7 @@ def test_a_checkpoint_is_complete_or_absent(make: Make, monkeypatch: pytest.Monk
         raise OSError("disk full")
 
     with monkeypatch.context() as patch:
-        patch.setattr("train.files.flush", fail)
+        patch.setattr("dreamer_spec.files.flush", fail)
         with pytest.raises(UserError, match="disk full"):
             loop.run(make(steps=90), FakeLearner)
     assert checkpoint.open_checkpoint(make().logdir) == before
@@ -238,7 +244,9 @@ def spoil(path: Path, damage: str) -> None:
 
 @pytest.mark.parametrize("name", ["learner.safetensors", "loop.safetensors", "run.json", "SHA256SUMS"])
 @pytest.mark.parametrize("damage", ["cut off", "a flipped bit", "missing"])
-def test_a_damaged_checkpoint_falls_back_to_the_one_before(make: Make, name: str, damage: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_damaged_checkpoint_falls_back_to_the_one_before(
+    make: Make, name: str, damage: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     whole = run_quietly(make(steps=120, logdir=make().logdir / "whole"))
     loop.run(make(steps=60), FakeLearner)
     loop.run(make(steps=90), FakeLearner)
@@ -247,7 +255,9 @@ def test_a_damaged_checkpoint_falls_back_to_the_one_before(make: Make, name: str
     capsys.readouterr()
     resumed = run_quietly(make(steps=120))
     output = capsys.readouterr().out
-    assert f"renamed to {newest}.damaged" in next(line for line in output.splitlines() if line.startswith("WARNING") and "damaged" in line)
+    assert f"renamed to {newest}.damaged" in next(
+        line for line in output.splitlines() if line.startswith("WARNING") and "damaged" in line
+    )
     assert "continuing at step 60" in output
     assert (newest.parent / "000000000090.damaged").is_dir()
     assert (resumed.counters.records, resumed.counters.train_steps) == (120, whole.counters.train_steps)
@@ -257,8 +267,11 @@ def test_a_damaged_checkpoint_falls_back_to_the_one_before(make: Make, name: str
 @pytest.mark.covers("LOOP-53", "REP-37")
 @pytest.mark.parametrize("which", ["newest", "all"])
 @pytest.mark.parametrize("damage", ["cut off", "a flipped bit", "missing"])
-def test_a_damaged_buffer_costs_no_checkpoint(make: Make, damage: str, which: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """The newest state of the buffer that can be read is taken, or an empty one; parameters and counters are those of the checkpoint."""
+def test_a_damaged_buffer_costs_no_checkpoint(
+    make: Make, damage: str, which: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The newest state of the buffer that can be read is taken, or an empty one; parameters and counters are those of
+    the checkpoint."""
     loop.run(make(steps=60), FakeLearner)
     loop.run(make(steps=90), FakeLearner)
     directory = make().logdir / "replay"
@@ -284,7 +297,9 @@ def test_a_damaged_buffer_costs_no_checkpoint(make: Make, damage: str, which: st
     else:
         assert records == 30
         assert {path.name: path.read_bytes() for path in (directory / "damaged").iterdir()} == files
-        assert 0 < resumed.counters.train_steps - trained < 30 * 32 // 6, "steps until the buffer is filled again are not paid for"
+        assert 0 < resumed.counters.train_steps - trained < 30 * 32 // 6, (
+            "steps until the buffer is filled again are not paid for"
+        )
     loop.run(make(steps=150), FakeLearner)
     assert "replay" not in "".join(line for line in capsys.readouterr().out.splitlines() if "WARNING" in line)
 
@@ -322,7 +337,8 @@ def forge(info: Any, rng: random.Random) -> None:
 
 
 def test_forged_descriptions_are_refused_or_sound(make: Make, tmp_path: Path) -> None:
-    """With right checksums, as a forger would write them. Whatever a description says: an agent that trains on, or one line."""
+    """With right checksums, as a forger would write them. Whatever a description says: an agent that trains on, or one
+    line."""
     options = make(task="gym:CartPole-v1", steps=40, eval_every=20, eval_episodes=1)
     loop.run(options, FakeLearner)
     folder = "checkpoints/000000000040"
@@ -382,7 +398,9 @@ def test_the_first_interrupt_saves(make: Make, monkeypatch: pytest.MonkeyPatch) 
 
 @pytest.mark.covers("LOOP-23")
 @pytest.mark.parametrize("policy_step", [9, 11], ids=["in the step before", "in its second step"])
-def test_an_evaluation_that_was_interrupted_is_made_up_for(make: Make, monkeypatch: pytest.MonkeyPatch, policy_step: int) -> None:
+def test_an_evaluation_that_was_interrupted_is_made_up_for(
+    make: Make, monkeypatch: pytest.MonkeyPatch, policy_step: int
+) -> None:
     """Evaluation is due at step 20, after 10 policy steps. Metrics are then those of a run in one go."""
     options = make(task="gym:CartPole-v1", eval_every=20, eval_episodes=4)
     whole = dataclasses.replace(options, logdir=options.logdir / "whole")
@@ -405,7 +423,11 @@ def test_an_evaluation_that_was_interrupted_is_made_up_for(make: Make, monkeypat
     assert loop.run(options, FakeLearner)
     lines, expected = (
         [
-            {name: value for name, value in line.items() if name != "seconds" and not name.startswith(("speed/", "time/", "memory/"))}
+            {
+                name: value
+                for name, value in line.items()
+                if name != "seconds" and not name.startswith(("speed/", "time/", "memory/"))
+            }
             for line in logged(logdir)
         ]
         for logdir in (options.logdir, whole.logdir)
@@ -420,7 +442,7 @@ def test_what_ends_the_last_evaluation_does_not_cost_the_training(make: Make, mo
 
     options = make(eval_episodes=2)
     with monkeypatch.context() as patch:
-        patch.setattr("train.schedule.evaluate", fail)
+        patch.setattr("dreamer_spec.schedule.evaluate", fail)
         with pytest.raises(KeyboardInterrupt):
             loop.run(options, FakeLearner)
     saved = checkpoint.open_checkpoint(options.logdir)

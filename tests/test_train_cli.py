@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 from train_fakes import FakeLearner
 
-import train.commands
-import train.setup
+import dreamer_spec.commands
+import dreamer_spec.setup
+from dreamer_spec.cli import build_parser, main, parse
+from dreamer_spec.commands import COMMANDS
+from dreamer_spec.errors import UserError
+from dreamer_spec.options import make_options, presets
 from spec import benchmarks, hyperparameters, load_config
-from train.cli import build_parser, main, parse
-from train.commands import COMMANDS
-from train.errors import UserError
-from train.options import make_options, presets
 
 SMALL = {"deter": 8, "units": 4, "stoch": 2, "classes": 2, "batch-size": 2, "batch-length": 3, "envs": 2}
 SHORT = {"steps": 60, "eval-every": 0, "eval-episodes": 1, "random-episodes": 1}
@@ -40,7 +40,7 @@ def fakes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Report:
     module = types.ModuleType("conformance.preflight")
     module.preflight = lambda *arguments, **options: report  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "conformance.preflight", module)
-    monkeypatch.setattr(train.setup, "learner_class", lambda backend: FakeLearner)
+    monkeypatch.setattr(dreamer_spec.setup, "learner_class", lambda backend: FakeLearner)
     monkeypatch.chdir(tmp_path)
     return report
 
@@ -77,7 +77,10 @@ def test_the_same_command_continues(capsys: pytest.CaptureFixture[str]) -> None:
         ("gym:NoSuchGame-v0", ["unknown task", "NoSuchGame"]),
         ("nonsense", ["unknown task", "dmc:DOMAIN-TASK"]),
         ("train_fakes:Sequences", ["unsupported space", "'words'", "Sequence"]),
-        ("train_fakes:nan_observation", ["train_fakes:nan_observation", "environment", "step 7", "'observation'", "nan"]),
+        (
+            "train_fakes:nan_observation",
+            ["train_fakes:nan_observation", "environment", "step 7", "'observation'", "nan"],
+        ),
         ("train_fakes:wrong_dtype", ["step 3", "'observation'", "dtype", "float32"]),
         ("train_fakes:wrong_shape", ["step 3", "'observation'", "(3,)", "(2,)"]),
     ],
@@ -90,23 +93,30 @@ def test_bad_environments(capsys: pytest.CaptureFixture[str], task: str, words: 
 
 def test_missing_extra(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "dm_env", None)
-    monkeypatch.delitem(sys.modules, "train.envs.dm_control", raising=False)
-    assert "pip install 'dreamer-spec[dm-control]'" in refusal(capsys, *FAST, "--task", "dmc:walker-walk", "--processes", "no")
+    monkeypatch.delitem(sys.modules, "dreamer_spec.envs.dm_control", raising=False)
+    assert "pip install 'dreamer-spec[dm-control]'" in refusal(
+        capsys, *FAST, "--task", "dmc:walker-walk", "--processes", "no"
+    )
 
 
 def test_missing_backend(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     def learner_class(backend: str) -> Any:
         raise ModuleNotFoundError("No module named 'optax'", name="optax")
 
-    monkeypatch.setattr(train.setup, "learner_class", learner_class)
+    monkeypatch.setattr(dreamer_spec.setup, "learner_class", learner_class)
     line = refusal(capsys, *FAST, "--task", "train_fakes:Counting")
     assert "the package optax: pip install 'dreamer-spec[jax]'" in line
 
 
 def test_checkpoint_of_another_configuration(capsys: pytest.CaptureFixture[str]) -> None:
     main([*FAST, "--task", "train_fakes:Counting"])
-    line = refusal(capsys, *FAST, "--task", "train_fakes:Counting", "--units", "8", "--batch-length", "2", "--free-nats", "2")
-    assert "batch_length: 3 in the checkpoint, 2 given; units: 4 in the checkpoint, 8 given. These may not change half way" in line
+    line = refusal(
+        capsys, *FAST, "--task", "train_fakes:Counting", "--units", "8", "--batch-length", "2", "--free-nats", "2"
+    )
+    assert (
+        "batch_length: 3 in the checkpoint, 2 given; units: 4 in the checkpoint, 8 given. These may not change half way"
+        in line
+    )
     assert "free_nats" not in line
 
 
@@ -169,7 +179,9 @@ def test_precedence_of_base_preset_and_command_line() -> None:
     assert default.config.envs == cartpole["hyperparameters"]["envs"]
     assert default.logdir == Path("runs/CartPole-v1-jax-seed0")
 
-    paper = parse(["--backend", "torch", "--preset", "dmc_proprio", "--task", "dmc:cheetah-run", "--envs", "3", "--seed", "4"])
+    paper = parse(
+        ["--backend", "torch", "--preset", "dmc_proprio", "--task", "dmc:cheetah-run", "--envs", "3", "--seed", "4"]
+    )
     assert (paper.task, paper.action_repeat, paper.steps) == ("dmc:cheetah-run", 2, 500_000)
     assert (paper.config.replay_ratio, paper.config.envs, paper.config.units) == (512, 3, 256)
     assert paper.logdir == Path("runs/dmc-cheetah-run-torch-seed4")
@@ -203,7 +215,11 @@ def test_every_hyperparameter_is_an_option_in_both_spellings() -> None:
 
 def test_the_first_version_is_not_for_training(capsys: pytest.CaptureFixture[str]) -> None:
     assert parse(["--backend", "jax", "--profile", "2024-04"]).config == dataclasses.replace(
-        parse(["--backend", "jax"]).config, beta2=0.999, warmup_steps=1000, continue_target="discounted", vector_loss_scale=1.0
+        parse(["--backend", "jax"]).config,
+        beta2=0.999,
+        warmup_steps=1000,
+        continue_target="discounted",
+        vector_loss_scale=1.0,
     )
     assert main(["--backend", "jax", "--profile", "2023"]) == 2
     error = capsys.readouterr().err
@@ -232,7 +248,17 @@ def test_whole_numbers_may_be_written_as_powers() -> None:
 
 def test_the_command_itself_says_one_line() -> None:
     """Without any of this file's fakes, in a process of its own."""
-    command = [sys.executable, "-m", "train", "--backend", "jax", "--task", "train_fakes:nan_observation", "--batch-size", "-1"]
+    command = [
+        sys.executable,
+        "-m",
+        "dreamer_spec",
+        "--backend",
+        "jax",
+        "--task",
+        "train_fakes:nan_observation",
+        "--batch-size",
+        "-1",
+    ]
     done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parent.parent, check=False)
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1
@@ -245,7 +271,9 @@ def test_presets_of_the_papers_protocols_have_its_numbers(name: str) -> None:
     protocol, options = benchmarks()[name], make_options("jax", {}, {}, name)
     assert (options.steps, options.action_repeat) == (protocol["steps"], protocol["action_repeat"])
     assert (options.config.envs, options.config.replay_ratio) == (protocol["envs"], protocol["replay_ratio"])
-    assert options.config == load_config("paper", protocol["size"], envs=protocol["envs"], replay_ratio=protocol["replay_ratio"])
+    assert options.config == load_config(
+        "paper", protocol["size"], envs=protocol["envs"], replay_ratio=protocol["replay_ratio"]
+    )
 
 
 # Mistakes before there is a run
@@ -255,17 +283,25 @@ def test_presets_of_the_papers_protocols_have_its_numbers(name: str) -> None:
     ("arguments", "words"),
     [
         ([], ["--backend is missing", "`train --backend jax` trains the default task", "train --help"]),
-        (["--task", "gym:A b", "--steps=9"], ["`train --backend jax --task 'gym:A b' --steps=9` trains with these options"]),
+        (
+            ["--task", "gym:A b", "--steps=9"],
+            ["`train --backend jax --task 'gym:A b' --steps=9` trains with these options"],
+        ),
         (["repot", "runs/a"], ["unknown command 'repot'; did you mean report?"]),
         (["runs/a"], ["unknown command 'runs/a' (see train --help)"]),
         (["--backend", "jax", "--learning-rat", "3"], ["unknown option --learning-rat; did you mean --learning-rate?"]),
         (["--backend", "jax", "--batch_siz=3"], ["unknown option --batch-siz; did you mean --batch-size?"]),
         (["--backend", "jax", "report"], ["unexpected 'report'"]),
-        (["eval", "runs/a", "--episode", "3"], ["unknown option --episode; did you mean --episodes? (see train eval --help)"]),
+        (
+            ["eval", "runs/a", "--episode", "3"],
+            ["unknown option --episode; did you mean --episodes? (see train eval --help)"],
+        ),
         (["--backend", "jax", "--preset", "dmc_propio"], ["unknown preset 'dmc_propio'", "did you mean dmc_proprio?"]),
     ],
 )
-def test_mistyped_words_are_told_what_is_close(capsys: pytest.CaptureFixture[str], arguments: list[str], words: list[str]) -> None:
+def test_mistyped_words_are_told_what_is_close(
+    capsys: pytest.CaptureFixture[str], arguments: list[str], words: list[str]
+) -> None:
     line = refusal(capsys, *arguments)
     assert all(word in line for word in words), line
 
@@ -276,7 +312,7 @@ def test_help_names_the_commands_and_what_each_does(capsys: pytest.CaptureFixtur
     text = capsys.readouterr().out
     for name, what in COMMANDS.items():
         assert re.search(rf"^  train {name} +{re.escape(what)}$", text, re.MULTILINE), name
-    modules = {path.stem for path in Path(train.commands.__path__[0]).glob("*.py")} - {"__init__"}
+    modules = {path.stem for path in Path(dreamer_spec.commands.__path__[0]).glob("*.py")} - {"__init__"}
     assert modules == set(COMMANDS)
 
 
@@ -317,12 +353,16 @@ def test_a_failed_preflight_leaves_no_log_directory(capsys: pytest.CaptureFixtur
     assert list(Path().iterdir()) == []
 
 
-def test_a_run_that_another_process_began_meanwhile_stays(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_that_another_process_began_meanwhile_stays(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Between the look at the log directory and its lock."""
     main([*FAST, "--task", "train_fakes:Counting"])
     before = sorted(Path("runs").rglob("*"))
     exists = Path.exists
-    monkeypatch.setattr(Path, "exists", lambda path, **given: exists(path, **given) and path.name != "train_fakes-Counting-jax-seed0")
+    monkeypatch.setattr(
+        Path, "exists", lambda path, **given: exists(path, **given) and path.name != "train_fakes-Counting-jax-seed0"
+    )
     line = refusal(capsys, *FAST, "--task", "train_fakes:Counting")
     assert "another process has begun a run in runs/train_fakes-Counting-jax-seed0 meanwhile" in line
     assert sorted(Path("runs").rglob("*")) == before

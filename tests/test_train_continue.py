@@ -1,4 +1,5 @@
-"""Runs that go on: with the options of their start, with changed ones, or as a new run with the parameters of another."""
+"""Runs that go on: with the options of their start, with changed ones, or as a new run with the parameters of
+another."""
 
 import json
 import re
@@ -12,23 +13,32 @@ from train_agents import plain_translation, random_learner_state
 from train_fakes import FakeLearner
 from train_runs import Make, batches, run_quietly
 
-import train.setup
+import dreamer_spec.setup
+from dreamer_spec import checkpoint, loop
+from dreamer_spec.about import read_about, write_about
+from dreamer_spec.cli import main
+from dreamer_spec.errors import UserError
+from dreamer_spec.options import Options, make_options, may_change
 from impl_torch.learner import Learner as TorchLearner
 from spec import Discrete, Spaces, Vector, hyperparameters, load_config
-from train import checkpoint, loop
-from train.about import read_about, write_about
-from train.cli import main
-from train.errors import UserError
-from train.options import Options, make_options, may_change
 
 SPACES = Spaces({"observation": Vector(4)}, {"action": Discrete((2,))})
-SMALL = ["--deter=8", "--units=4", "--stoch=2", "--classes=2", "--batch-size=2", "--batch-length=3", "--envs=2", "--no-preflight"]
+SMALL = [
+    "--deter=8",
+    "--units=4",
+    "--stoch=2",
+    "--classes=2",
+    "--batch-size=2",
+    "--batch-length=3",
+    "--envs=2",
+    "--no-preflight",
+]
 SHORT = ["--steps=60", "--eval-every=0", "--eval-episodes=1", "--random-episodes=1"]
 
 
 @pytest.fixture
 def fakes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(train.setup, "learner_class", lambda backend: FakeLearner)
+    monkeypatch.setattr(dreamer_spec.setup, "learner_class", lambda backend: FakeLearner)
     monkeypatch.chdir(tmp_path)
     FakeLearner.diary.clear()
 
@@ -126,7 +136,15 @@ def test_steps_that_have_been_made_are_said(make: Make, capsys: pytest.CaptureFi
 
 @pytest.mark.usefixtures("fakes")
 def test_resume_takes_every_option_from_the_run(capsys: pytest.CaptureFixture[str]) -> None:
-    command = ["--backend=jax", "--size=tiny", *SMALL, *SHORT, "--task=train_fakes:Counting", "--logdir=runs/a b", "--learning-rate=1e-3"]
+    command = [
+        "--backend=jax",
+        "--size=tiny",
+        *SMALL,
+        *SHORT,
+        "--task=train_fakes:Counting",
+        "--logdir=runs/a b",
+        "--learning-rate=1e-3",
+    ]
     assert main([*command, "--action-repeat=2", "--keep-checkpoints=3", "--seed=4"]) == 0
     before = read_about(Path("runs/a b"))
     assert main(["resume", "runs/a b", "--task", "train_fakes:Counting", "--steps=90", "--entropy_scale=1e-3"]) == 0
@@ -157,8 +175,12 @@ def test_what_cannot_be_resumed_is_named(capsys: pytest.CaptureFixture[str]) -> 
     main(["--backend=jax", "--size=tiny", *SMALL, *SHORT, "--task=train_fakes:Counting", "--logdir=run"])
     task = ["--task", "train_fakes:Counting"]
     assert "--task train_fakes:Counting" in refusal(capsys, "resume", "run")
-    assert "batch_size: 2 in the checkpoint, 8 given. These may not change" in refusal(capsys, "resume", "run", *task, "--batch-size=8")
-    assert "task: train_fakes:Counting in the checkpoint" in refusal(capsys, "resume", "run", "--task", "train_fakes:Endless")
+    assert "batch_size: 2 in the checkpoint, 8 given. These may not change" in refusal(
+        capsys, "resume", "run", *task, "--batch-size=8"
+    )
+    assert "task: train_fakes:Counting in the checkpoint" in refusal(
+        capsys, "resume", "run", "--task", "train_fakes:Endless"
+    )
     assert "seed: 0 in the checkpoint, 3 given" in refusal(capsys, "resume", "run", *task, "--seed=3")
     for name in ("--preset", "--logdir", "--from", "--seeds", "--resume"):  # with these a run begins
         assert f"unknown option {name}" in refusal(capsys, "resume", "run", *task, name, "1")
@@ -169,7 +191,10 @@ def test_what_cannot_be_resumed_is_named(capsys: pytest.CaptureFixture[str]) -> 
     for path in Path("run/checkpoints").iterdir():
         path.rename(f"run/{path.name}")
     line = refusal(capsys, "resume", "run", *task)
-    assert "run holds no checkpoint, so there is nothing to continue; the command that begins it: train --backend jax" in line
+    assert (
+        "run holds no checkpoint, so there is nothing to continue; the command that begins it: train --backend jax"
+        in line
+    )
 
 
 @pytest.mark.usefixtures("fakes")
@@ -209,10 +234,31 @@ def agent_checkpoint(logdir: Path, config: Any, spaces: Spaces = SPACES, **chang
 
 
 def tiny(tmp_path: Path, **given: Any) -> Options:
-    overrides = {"deter": 8, "units": 4, "stoch": 2, "classes": 2, "batch_size": 2, "batch_length": 3, "envs": 2, "blocks": 2, "bins": 5}
-    plain = {"task": "gym:CartPole-v1", "size": "tiny", "steps": 60, "logdir": tmp_path / "new", "preflight": False, "device": "cpu"}
+    overrides = {
+        "deter": 8,
+        "units": 4,
+        "stoch": 2,
+        "classes": 2,
+        "batch_size": 2,
+        "batch_length": 3,
+        "envs": 2,
+        "blocks": 2,
+        "bins": 5,
+    }
+    plain = {
+        "task": "gym:CartPole-v1",
+        "size": "tiny",
+        "steps": 60,
+        "logdir": tmp_path / "new",
+        "preflight": False,
+        "device": "cpu",
+    }
     settings = {**plain, "eval_every": 0, "eval_episodes": 0, "random_episodes": 0, **given}
-    return make_options("torch", settings, overrides | {name: settings.pop(name) for name in list(settings) if name in hyperparameters()})
+    return make_options(
+        "torch",
+        settings,
+        overrides | {name: settings.pop(name) for name in list(settings) if name in hyperparameters()},
+    )
 
 
 @pytest.mark.covers("LOOP-72")
@@ -220,7 +266,8 @@ def tiny(tmp_path: Path, **given: Any) -> Options:
 def test_a_new_run_begins_with_the_parameters_of_another(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], source: str
 ) -> None:
-    """Parameters, slow critic and return range, bit for bit; a fresh optimizer, fresh counters, and another learning rate if wanted."""
+    """Parameters, slow critic and return range, bit for bit; a fresh optimizer, fresh counters, and another learning
+    rate if wanted."""
     options = tiny(tmp_path, from_=tmp_path / source, learning_rate=1e-3)
     config = tiny(tmp_path).config
     agent_checkpoint(tmp_path / "old", config)
@@ -240,7 +287,9 @@ def test_a_new_run_begins_with_the_parameters_of_another(
         else:
             np.testing.assert_array_equal(begun[name], array, err_msg=name)
     out = capsys.readouterr().out
-    assert f"beginning with the parameters of {tmp_path}/old/checkpoints/000000001000 (gym:CartPole-v1, step 1,000)" in out
+    assert (
+        f"beginning with the parameters of {tmp_path}/old/checkpoints/000000001000 (gym:CartPole-v1, step 1,000)" in out
+    )
     about = read_about(options.logdir)
     assert about
     assert about["origin"] == {
@@ -259,7 +308,9 @@ def test_a_new_run_begins_with_the_parameters_of_another(
         again = read_about(options.logdir)
         assert again
         assert again["origin"] == about["origin"]
-    with pytest.raises(UserError, match=f"which began with the parameters of {tmp_path}/{source}, and --from is for a new run"):
+    with pytest.raises(
+        UserError, match=f"which began with the parameters of {tmp_path}/{source}, and --from is for a new run"
+    ):
         loop.run(tiny(tmp_path, from_=tmp_path / "away", learning_rate=1e-3))
 
 
@@ -280,7 +331,10 @@ def test_what_does_not_fit_is_named_and_nothing_is_begun(tmp_path: Path) -> None
 
     assert "no checkpoint in" in message()
     agent_checkpoint(tmp_path / "old", options.config, Spaces({"observation": Vector(5)}, {"action": Discrete((2,))}))
-    assert 'observations observation: {"kind": "vector", "size": 5} in the checkpoint, {"kind": "vector", "size": 4} given' in message()
+    assert (
+        'observations observation: {"kind": "vector", "size": 5} in the checkpoint, {"kind": "vector", "size": 4} given'
+        in message()
+    )
     agent_checkpoint(tmp_path / "old", tiny(tmp_path, units=8).config)
     assert re.search(r"has other parameters: \S+: .* in the checkpoint, .* given; .* and \d+ more", message())
     config = options.config

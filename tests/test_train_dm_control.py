@@ -1,4 +1,5 @@
-"""The DeepMind Control Suite: every task acts from vectors without a graphics library, and what MUJOCO_GL says is used or named."""
+"""The DeepMind Control Suite: every task acts from vectors without a graphics library, and what MUJOCO_GL says is used
+or named."""
 
 import json
 import os
@@ -15,8 +16,8 @@ pytest.importorskip("dm_control")
 STEPS = """
 import json, sys
 import numpy as np
-from train.envs import make_env, random_actions
-from train.errors import UserError
+from dreamer_spec.envs import make_env, random_actions
+from dreamer_spec.errors import UserError
 
 for task in sys.argv[1:] or [f"dmc:{domain}-{name}" for domain, name in __import__("dm_control.suite").suite.ALL_TASKS]:
     try:
@@ -36,10 +37,13 @@ for task in sys.argv[1:] or [f"dmc:{domain}-{name}" for domain, name in __import
 
 
 def stepped(*tasks: str, **environment: str) -> list[dict[str, Any]]:
-    """What becomes of the tasks, all if none is named, in a process of their own: what renders is chosen once in a process."""
+    """What becomes of the tasks, all if none is named, in a process of their own: what renders is chosen once in a
+    process."""
     unset = {"MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY", "PYOPENGL_PLATFORM"}
     variables = {name: value for name, value in os.environ.items() if name not in unset} | environment
-    result = subprocess.run([sys.executable, "-c", STEPS, *tasks], env=variables, capture_output=True, text=True, timeout=600)
+    result = subprocess.run(
+        [sys.executable, "-c", STEPS, *tasks], env=variables, capture_output=True, text=True, timeout=600
+    )
     assert result.returncode == 0, result.stderr
     return [json.loads(line) for line in result.stdout.splitlines()]
 
@@ -66,7 +70,12 @@ def test_tasks_from_vectors_need_no_setting(task: str) -> None:
 
 @pytest.mark.parametrize(
     ("value", "reason"),
-    [("glfw", "DISPLAY is not set"), ("disabled", "No OpenGL"), ("nonsense", "must be one of"), ("on", "DISPLAY is not set")],
+    [
+        ("glfw", "DISPLAY is not set"),
+        ("disabled", "No OpenGL"),
+        ("nonsense", "must be one of"),
+        ("on", "DISPLAY is not set"),
+    ],
 )
 def test_what_cannot_render_is_a_line(value: str, reason: str) -> None:
     (result,) = stepped("dmc_vision:cartpole-balance", MUJOCO_GL=value)

@@ -9,10 +9,10 @@ import pytest
 import train_fakes
 from gymnasium import spaces as gym
 
+from dreamer_spec.envs import ContractEnv, Environments, make_env, random_actions, translate
+from dreamer_spec.errors import UserError
 from reference_numpy.training_loop import derive_seed, environment_action
 from spec import Discrete, Image, Vector
-from train.envs import ContractEnv, Environments, make_env, random_actions, translate
-from train.errors import UserError
 
 TWO = gym.Discrete(2)
 
@@ -41,7 +41,11 @@ def test_observation_spaces(space: gymnasium.Space, expected: object) -> None:
 
 @pytest.mark.parametrize(
     ("space", "expected"),
-    [(gym.Box(-1, 1, (2, 3)), Vector(6)), (gym.Discrete(4, start=-1), Discrete((4,))), (gym.MultiDiscrete([2, 3]), Discrete((2, 3)))],
+    [
+        (gym.Box(-1, 1, (2, 3)), Vector(6)),
+        (gym.Discrete(4, start=-1), Discrete((4,))),
+        (gym.MultiDiscrete([2, 3]), Discrete((2, 3))),
+    ],
 )
 @pytest.mark.covers("LOOP-31")
 def test_action_spaces(space: gymnasium.Space, expected: object) -> None:
@@ -99,7 +103,9 @@ def test_every_kind_of_action_becomes_the_environments() -> None:
 @pytest.mark.covers("LOOP-12", "CON-27")
 def test_actions_agree_with_the_reference() -> None:
     low, high = np.float32([-3, 0, -np.inf, -np.inf, 0.5]), np.float32([1, 1e3, np.inf, 0.5, np.inf])
-    translation = translate(TWO, gym.Dict({"a": gym.Discrete(3), "b": gym.Box(low, high), "c": gym.MultiDiscrete([2, 2])}))
+    translation = translate(
+        TWO, gym.Dict({"a": gym.Discrete(3), "b": gym.Box(low, high), "c": gym.MultiDiscrete([2, 2])})
+    )
     rng = np.random.default_rng(0)
     for _ in range(100):
         flat = rng.normal(size=translation.spaces.action_size).astype(np.float32)
@@ -124,7 +130,8 @@ def test_a_fourth_channel_is_not_opacity() -> None:
 @pytest.mark.parametrize(("height", "width", "channels"), [(210, 160, 3), (100, 31, 1), (20, 30, 4), (64, 90, 3)])
 @pytest.mark.covers("LOOP-30")
 def test_images_are_resized_bilinearly(height: int, width: int, channels: int) -> None:
-    """Down and up, in every channel: a triangle around each output pixel's centre, as wide as two pixels of the coarser image."""
+    """Down and up, in every channel: a triangle around each output pixel's centre, as wide as two pixels of the coarser
+    image."""
 
     def weights(old: int, new: int) -> np.ndarray:
         distance = np.arange(old) + 0.5 - (np.arange(new)[:, None] + 0.5) * old / new
@@ -166,9 +173,13 @@ def _records(processes: bool, steps: int = 11, action_repeat: int = 1) -> list[d
 @pytest.mark.parametrize("processes", [False, True])
 @pytest.mark.covers("LOOP-2", "LOOP-7", "LOOP-10", "LOOP-11", "LOOP-29", "CON-9", "CON-10", "CON-11")
 def test_each_observation_is_one_record(processes: bool) -> None:
-    """Two episodes and the start of a third; the first terminates, the second is truncated. Nothing is lost, nothing comes twice."""
+    """Two episodes and the start of a third; the first terminates, the second is truncated. Nothing is lost, nothing
+    comes twice."""
     stream = [{key: value[1] for key, value in record.items()} for record in _records(processes)]
-    assert [tuple(record["observation"]) for record in stream] == [(e, t) for e in (0, 1) for t in range(5)] + [(2, 0), (2, 1)]
+    assert [tuple(record["observation"]) for record in stream] == [(e, t) for e in (0, 1) for t in range(5)] + [
+        (2, 0),
+        (2, 1),
+    ]
     assert [record["reward"] for record in stream] == [0, 1, 2, 3, 4, 0, 11, 12, 13, 14, 0, 21]
     assert [t for t, record in enumerate(stream) if record["is_first"]] == [0, 5, 10]
     assert [t for t, record in enumerate(stream) if record["is_last"]] == [4, 9]
@@ -188,22 +199,35 @@ def test_action_repeat_sums_rewards_and_stops_at_the_end() -> None:
 @pytest.mark.covers("LOOP-27", "LOOP-29")
 def test_action_repeat_is_the_same_in_every_episode(processes: bool) -> None:
     """The first episode terminates, the second is truncated, both in the middle of a repetition; a third begins."""
-    stream = [{key: value[1] for key, value in record.items()} for record in _records(processes, steps=7, action_repeat=3)]
-    assert [tuple(record["observation"]) for record in stream] == [(e, t) for e in (0, 1) for t in (0, 3, 4)] + [(2, 0), (2, 3)]
+    stream = [
+        {key: value[1] for key, value in record.items()} for record in _records(processes, steps=7, action_repeat=3)
+    ]
+    assert [tuple(record["observation"]) for record in stream] == [(e, t) for e in (0, 1) for t in (0, 3, 4)] + [
+        (2, 0),
+        (2, 3),
+    ]
     assert [record["reward"] for record in stream] == [0, 6, 4, 0, 36, 14, 0, 66]
     assert [t for t, record in enumerate(stream) if record["is_first"]] == [0, 3, 6]
     assert [t for t, record in enumerate(stream) if record["is_last"]] == [2, 5]
     assert [t for t, record in enumerate(stream) if record["is_terminal"]] == [2]
 
 
-def _limited(inner: type[train_fakes.Counting], limit: int, action_repeat: int, steps: int) -> list[dict[str, np.ndarray]]:
+def _limited(
+    inner: type[train_fakes.Counting], limit: int, action_repeat: int, steps: int
+) -> list[dict[str, np.ndarray]]:
     envs = Environments(
-        lambda index: ContractEnv(gymnasium.wrappers.TimeLimit(inner(), limit), "t", index, action_repeat=action_repeat), 1, False
+        lambda index: ContractEnv(
+            gymnasium.wrappers.TimeLimit(inner(), limit), "t", index, action_repeat=action_repeat
+        ),
+        1,
+        False,
     )
     return [envs.reset([0]), *(envs.step(np.zeros((1, 2), np.float32)) for _ in range(steps))]
 
 
-@pytest.mark.parametrize(("action_repeat", "times"), [(1, [0, 1, 2, 3, 4, 5]), (2, [0, 2, 4, 5]), (3, [0, 3, 5]), (9, [0, 5])])
+@pytest.mark.parametrize(
+    ("action_repeat", "times"), [(1, [0, 1, 2, 3, 4, 5]), (2, [0, 2, 4, 5]), (3, [0, 3, 5]), (9, [0, 5])]
+)
 @pytest.mark.covers("LOOP-28")
 def test_a_time_limit_counts_frames_and_truncates(action_repeat: int, times: list[int]) -> None:
     records = _limited(train_fakes.Endless, limit=5, action_repeat=action_repeat, steps=2 * len(times) - 1)
@@ -216,7 +240,9 @@ def test_a_time_limit_counts_frames_and_truncates(action_repeat: int, times: lis
 def test_an_end_at_the_time_limit_is_terminal() -> None:
     records = _limited(train_fakes.Counting, limit=train_fakes.EPISODE, action_repeat=1, steps=9)
     assert [t for t, record in enumerate(records) if record["is_last"][0]] == [4, 9]
-    assert [t for t, record in enumerate(records) if record["is_terminal"][0]] == [4], "the second episode is only truncated"
+    assert [t for t, record in enumerate(records) if record["is_terminal"][0]] == [4], (
+        "the second episode is only truncated"
+    )
 
 
 @pytest.mark.covers("LOOP-29", "LOOP-33")
@@ -263,7 +289,14 @@ def test_an_adapted_observation_is_a_copy() -> None:
     inner.observation = lambda: shared  # type: ignore[method-assign]
     first, _ = ContractEnv(inner, "t").reset()
     before = {key: value.copy() for key, value in first.items()}
-    for value in (shared["camera"], shared["depth"], shared["arm"]["angle"], shared["arm"]["touch"], shared["items"], shared["matrix"]):
+    for value in (
+        shared["camera"],
+        shared["depth"],
+        shared["arm"]["angle"],
+        shared["arm"]["touch"],
+        shared["items"],
+        shared["matrix"],
+    ):
         value[...] = 1
     assert all((first[key] == before[key]).all() for key in first)
     counting = ContractEnv(train_fakes.Counting(), "t")

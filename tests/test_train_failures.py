@@ -1,4 +1,5 @@
-"""Whatever an environment raises, in its steps and before the first one: a failure like any other, and a line where it cannot go on."""
+"""Whatever an environment raises, in its steps and before the first one: a failure like any other, and a line where it
+cannot go on."""
 
 import functools
 import os
@@ -11,9 +12,9 @@ import pytest
 import train_fakes
 from train_surroundings import is_running
 
-from train.envs import ContractEnv, Environments, Failure, make_env, try_out
-from train.errors import UserError
-from train.signals import stoppable
+from dreamer_spec.envs import ContractEnv, Environments, Failure, make_env, try_out
+from dreamer_spec.errors import UserError
+from dreamer_spec.signals import stoppable
 
 TIMEOUT = 3.0  # seconds: enough to make a fake, also on a busy machine
 CALM = np.zeros((1, 2), np.float32)
@@ -46,7 +47,9 @@ def make_moody(where: str, counter: Path, patience: int, index: int) -> Contract
 @pytest.mark.parametrize("processes", [False, True])
 @pytest.mark.parametrize("where", ["make", "reset"])
 @pytest.mark.covers("LOOP-32", "LOOP-46")
-def test_what_fails_now_and_then_before_the_first_record_is_tried_again(tmp_path: Path, where: str, processes: bool) -> None:
+def test_what_fails_now_and_then_before_the_first_record_is_tried_again(
+    tmp_path: Path, where: str, processes: bool
+) -> None:
     envs = Environments(functools.partial(make_moody, where, tmp_path / "counter", 2), 1, processes)
     try:
         assert envs.reset([0])["is_first"].all()
@@ -89,7 +92,11 @@ def test_a_trial_finds_the_spaces_and_slow_steps(task: str, deserves: bool) -> N
 def test_an_environment_that_fails_in_its_trial_gets_a_process(tmp_path: Path, where: str) -> None:
     told: list[Failure] = []
     task = "train_fakes:wrong_dtype"
-    make = functools.partial(make_env, task) if where == "step" else functools.partial(make_moody, "reset", tmp_path / "counter", 9)
+    make = (
+        functools.partial(make_env, task)
+        if where == "step"
+        else functools.partial(make_moody, "reset", tmp_path / "counter", 9)
+    )
     assert try_out(make, told.append, seed=0).deserves_process
     assert [failure.kind for failure in told] == ["garbage" if where == "step" else "error"]
 
@@ -99,7 +106,9 @@ def test_an_environment_that_fails_in_its_trial_gets_a_process(tmp_path: Path, w
 def test_a_trial_that_hangs_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str, words: str) -> None:
     monkeypatch.setenv("STUCK", f"{where}:loop")
     monkeypatch.setenv("ARRIVED", str(tmp_path / "arrived"))
-    with pytest.raises(UserError, match=rf"task stuck, environment 0, {words}: no answer within 3 seconds \(--env-timeout\)$"):
+    with pytest.raises(
+        UserError, match=rf"task stuck, environment 0, {words}: no answer within 3 seconds \(--env-timeout\)$"
+    ):
         try_out(functools.partial(make_stuck, dict(os.environ)), pytest.fail, "stuck", seed=0, timeout=TIMEOUT)
     assert not is_running(int((tmp_path / "arrived").read_text()))
 
@@ -206,12 +215,17 @@ def test_a_process_that_ends_without_a_word_is_not_said_to_have_said_something()
         envs.close()
     (failure,) = envs.take_failures()
     assert failure.kind == "crash"
-    assert failure.message == "task t, environment 0, step 1: its process ended with exit code 0; if it said why, that is above"
+    assert (
+        failure.message
+        == "task t, environment 0, step 1: its process ended with exit code 0; if it said why, that is above"
+    )
 
 
 @pytest.mark.covers("LOOP-32")
 def test_ctrl_c_is_no_failure() -> None:
-    envs = Environments(lambda index: ContractEnv(train_fakes.Faulty(1, error=KeyboardInterrupt()), "t", index), 1, False)
+    envs = Environments(
+        lambda index: ContractEnv(train_fakes.Faulty(1, error=KeyboardInterrupt()), "t", index), 1, False
+    )
     envs.reset([0])
     with pytest.raises(KeyboardInterrupt):
         envs.step(CALM)
@@ -255,7 +269,22 @@ def test_flags_may_be_booleans_or_whole_numbers(name: str, kind: Callable[[bool]
         assert all(type(value) is bool for value in flags.values())
 
 
-WRONG_FLAGS = [float("nan"), 0.0, 1.0, "False", "", None, 2, -1, [], [False, True], {}, np.zeros(2, bool), np.float32(1), np.array("x")]
+WRONG_FLAGS = [
+    float("nan"),
+    0.0,
+    1.0,
+    "False",
+    "",
+    None,
+    2,
+    -1,
+    [],
+    [False, True],
+    {},
+    np.zeros(2, bool),
+    np.float32(1),
+    np.array("x"),
+]
 
 
 @pytest.mark.parametrize("name", ["terminated", "truncated"])

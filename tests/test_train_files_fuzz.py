@@ -1,7 +1,8 @@
 """Mutated checkpoints and policies: every outcome is what was written, another sound agent, or a clear error.
 
-Half of the mutants get checksums that agree with them, as a forger's would. The mutants are loaded in a process of its own with little
-memory: who believes a size before looking at it fails there. `python tests/test_train_files_fuzz.py FIRST LAST` is that process.
+Half of the mutants get checksums that agree with them, as a forger's would. The mutants are loaded in a process of its
+own with little memory: who believes a size before looking at it fails there. `python tests/test_train_files_fuzz.py
+FIRST LAST` is that process.
 """
 
 import collections
@@ -25,15 +26,18 @@ import pytest
 from train_agents import save_checkpoint
 
 from conformance.problems import random_observations, small_config
+from dreamer_spec.checkpoint import FILES, open_checkpoint
+from dreamer_spec.errors import UserError
+from dreamer_spec.files import read_arrays, read_json, seal
+from dreamer_spec.policy import DESCRIPTION, PARAMETERS, Policy, save
+from dreamer_spec.saved_agent import SavedAgent, agent_of
 from spec import Discrete, Image, Spaces, Vector
-from train.checkpoint import FILES, open_checkpoint
-from train.errors import UserError
-from train.files import read_arrays, read_json, seal
-from train.policy import DESCRIPTION, PARAMETERS, Policy, save
-from train.saved_agent import SavedAgent, agent_of
 
 CONFIG = small_config("paper", "float32")
-TASK = Spaces({"position": Vector(3), "mode": Discrete((3, 2)), "image": Image(16, 16, 3)}, {"arm": Vector(2), "buttons": Discrete((2, 3))})
+TASK = Spaces(
+    {"position": Vector(3), "mode": Discrete((3, 2)), "image": Image(16, 16, 3)},
+    {"arm": Vector(2), "buttons": Discrete((2, 3))},
+)
 MEMORY = Path("/dev/shm") if Path("/dev/shm").is_dir() else None
 HEADROOM = 256 * 2**20  # bytes of address space beyond those of the process before the first mutant
 LONGEST = 20  # seconds for one mutant
@@ -41,7 +45,8 @@ LONGEST_MESSAGE = 1000  # characters
 
 
 class TooLong(BaseException):
-    """A mutant takes longer than LONGEST seconds. Not a TimeoutError: that is an OSError, which a loader takes for a damaged file."""
+    """A mutant takes longer than LONGEST seconds. Not a TimeoutError: that is an OSError, which a loader takes for a
+    damaged file."""
 
 
 # Mutations of the bytes of a file
@@ -80,13 +85,54 @@ def hostile_number(data: bytearray, chance: random.Random) -> None:
     data[where : where + 4] = np.float32(chance.choice([np.nan, np.inf, -3e38, 1e-45])).tobytes()
 
 
-BYTES: list[Callable[[bytearray, random.Random], None]] = [flip_bit, overwrite, zero, cut, grow, reverse, hostile_number]
+BYTES: list[Callable[[bytearray, random.Random], None]] = [
+    flip_bit,
+    overwrite,
+    zero,
+    cut,
+    grow,
+    reverse,
+    hostile_number,
+]
 
 # Mutations of JSON: of a description, or of the header of a safetensors file
 
 HOSTILE: list[Any] = [
-    *(None, True, False, -1, 0, 1, 2, 7, 2**31, 2**53, 2**63 - 1, 2**64, 10**400, 0.5, -0.0, 1e308, float("nan"), float("inf")),
-    *("", "x", "x" * 100_000, "\ud800", "../../etc/passwd", "vector", "image", [], {}, [0], [2**40, 2**40], [1] * 70, {"kind": "image"}),
+    *(
+        None,
+        True,
+        False,
+        -1,
+        0,
+        1,
+        2,
+        7,
+        2**31,
+        2**53,
+        2**63 - 1,
+        2**64,
+        10**400,
+        0.5,
+        -0.0,
+        1e308,
+        float("nan"),
+        float("inf"),
+    ),
+    *(
+        "",
+        "x",
+        "x" * 100_000,
+        "\ud800",
+        "../../etc/passwd",
+        "vector",
+        "image",
+        [],
+        {},
+        [0],
+        [2**40, 2**40],
+        [1] * 70,
+        {"kind": "image"},
+    ),
     *("F64", "BF16", "F8_E4M3", "BOOL", "C64", [0, 2**60], [0, 0], [[[[[[]]]]]], [-1, 4], ["a"], [2] * 5000),
 ]
 
@@ -129,7 +175,9 @@ def edit(tree: Any, chance: random.Random) -> str:
     elif kind == 1:  # deep
         text = text.replace("[", "[" * chance.choice([100, 100_000]), 1)
     elif kind == 2:
-        text = chance.choice(["", "null", "[]", "3", '"x"', "{" * 50_000, '{"a":' * 50_000, "[" * 500_000, " " * (2**20 + 1), "\ufeff{}"])
+        text = chance.choice(
+            ["", "null", "[]", "3", '"x"', "{" * 50_000, '{"a":' * 50_000, "[" * 500_000, " " * (2**20 + 1), "\ufeff{}"]
+        )
     return text
 
 
@@ -147,7 +195,9 @@ def relabel(header: dict[str, Any], chance: random.Random) -> str:
     entry = header[one]
     kind = chance.choice(["dtype", "dtype", "shape", "exchange", "flatten", "empty", "axes"])
     if kind == "dtype":
-        entry["dtype"] = chance.choice(["I32", "U32", "F16", "BF16", "F64", "C64", "F8_E4M3", "F8_E5M2", "F4", "BOOL", "I8"])
+        entry["dtype"] = chance.choice(
+            ["I32", "U32", "F16", "BF16", "F64", "C64", "F8_E4M3", "F8_E5M2", "F4", "BOOL", "I8"]
+        )
         size = {"F16": 2, "BF16": 2, "F64": 8, "C64": 8, "F4": 0.5, "I32": 4, "U32": 4}.get(entry["dtype"], 1)
         first, last = entry["data_offsets"]
         entry["shape"] = [int((last - first) / size)]
@@ -195,7 +245,14 @@ def mutate(folder: Path, names: tuple[str, ...], chance: random.Random) -> str:
         path = folder / chance.choice([*names, "SHA256SUMS"])
         path.unlink()
         if kind == "irregular":
-            chance.choice([path.mkdir, lambda: os.mkfifo(path), lambda: path.symlink_to("/dev/zero"), lambda: path.symlink_to(path)])()
+            chance.choice(
+                [
+                    path.mkdir,
+                    lambda: os.mkfifo(path),
+                    lambda: path.symlink_to("/dev/zero"),
+                    lambda: path.symlink_to(path),
+                ]
+            )()
     elif kind == "json":
         path = next(folder / name for name in names if name.endswith(".json"))
         path.write_bytes(edit(json.loads(path.read_text()), chance).encode("utf-8", "surrogatepass"))
@@ -272,7 +329,10 @@ class Original:
 def originals(directory: Path) -> list[Original]:
     checkpoint = save_checkpoint(directory / "run", CONFIG, TASK, task="gym:Robot-v0", image_size=16)
     save(directory / "policy", agent_of(open_checkpoint(checkpoint)))
-    return [Original(checkpoint, FILES, load_checkpoint), Original(directory / "policy", (PARAMETERS, DESCRIPTION), load_policy)]
+    return [
+        Original(checkpoint, FILES, load_checkpoint),
+        Original(directory / "policy", (PARAMETERS, DESCRIPTION), load_policy),
+    ]
 
 
 def outcome(original: Original, expected: SavedAgent, seed: int) -> tuple[str, str]:
@@ -316,7 +376,10 @@ def run(seeds: range) -> dict[str, Any]:
     counts: dict[str, collections.Counter[str]] = collections.defaultdict(collections.Counter)
     with tempfile.TemporaryDirectory(dir=MEMORY) as name:
         chosen = originals(Path(name))
-        expected = [original.load(Path(shutil.copytree(original.folder, Path(name) / f"copy{n}"))) for n, original in enumerate(chosen)]
+        expected = [
+            original.load(Path(shutil.copytree(original.folder, Path(name) / f"copy{n}")))
+            for n, original in enumerate(chosen)
+        ]
         used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (used + HEADROOM, used + HEADROOM))
         resident, start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.monotonic()
@@ -339,7 +402,9 @@ def mutants(first: int, last: int) -> collections.Counter[str]:
     done = subprocess.run(command, capture_output=True, text=True, env=environment)
     assert done.returncode == 0, done.stderr[-4000:]
     result = json.loads(done.stdout)
-    total: collections.Counter[str] = sum((collections.Counter(counts) for counts in result["counts"].values()), collections.Counter())
+    total: collections.Counter[str] = sum(
+        (collections.Counter(counts) for counts in result["counts"].values()), collections.Counter()
+    )
     assert total.total() == last - first
     assert result["grown"] < 128, result
     return total
@@ -356,20 +421,27 @@ def array(dtype: str, shape: list[int], length: int) -> str:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (safetensors_file(f"{{{array('F32', [1], 4)}, {array('I32', [1], 4)}}}", b"1234"), "the name 'a' occurs more than once"),
+        (
+            safetensors_file(f"{{{array('F32', [1], 4)}, {array('I32', [1], 4)}}}", b"1234"),
+            "the name 'a' occurs more than once",
+        ),
         (safetensors_file(f"{{{array('BF16', [2], 4)}}}", b"1234"), "'a' has the dtype BF16; expected one of F64, F32"),
         (safetensors_file(f"{{{array('F8_E4M3', [4], 4)}}}", b"1234"), "'a' has the dtype F8_E4M3"),
         (safetensors_file(f"{{{array('F32', [0, 2**62], 0)}}}"), "'a' has the shape .* expected at most 8 axes"),
         (safetensors_file(f"{{{array('F32', [1] * 70, 4)}}}", b"1234"), "'a' has the shape .* expected at most 8 axes"),
         (safetensors_file(f"{{{array('F32', [2**40], 2**42)}}}", b"1234"), "file not fully covered"),
-        (safetensors_file(" " * 2**20 + "{}"), "the header says that it is 1,048,578 bytes long; expected at most 1,048,576"),
+        (
+            safetensors_file(" " * 2**20 + "{}"),
+            "the header says that it is 1,048,578 bytes long; expected at most 1,048,576",
+        ),
         ((2**62).to_bytes(8, "little") + b"{}", "the header says that it is 4,611,686,018,427,387,904 bytes long"),
         (safetensors_file('{"a":' * 10_000), "recursion"),
         (b"", "header"),
     ],
 )
 def test_what_safetensors_would_let_through_is_refused(content: bytes, message: str, tmp_path: Path) -> None:
-    """Its parser checks sizes, but not dtypes that NumPy lacks, sides that no array has, names that occur twice, and long headers."""
+    """Its parser checks sizes, but not dtypes that NumPy lacks, sides that no array has, names that occur twice, and
+    long headers."""
     path = tmp_path / "file.safetensors"
     path.write_bytes(content)
     with pytest.raises(ValueError, match=message):

@@ -10,10 +10,10 @@ import train_fakes
 from train_fakes import FakeLearner
 from train_runs import Make, run_quietly
 
-from train import forecast, loop
-from train.envs import translate
-from train.options import make_options
-from train.state import Counters
+from dreamer_spec import forecast, loop
+from dreamer_spec.envs import translate
+from dreamer_spec.options import make_options
+from dreamer_spec.state import Counters
 
 Usage = collections.namedtuple("Usage", "total used free")
 
@@ -27,7 +27,9 @@ def test_the_bytes_of_a_record_are_those_of_the_buffer(make: Make, env: str, det
     assert forecast.record_bytes(state.envs.spaces, options) == stored
 
 
-def said(monkeypatch: pytest.MonkeyPatch, make: Make, memory: int | None, free: int, parameters: int = 10**6, **given: Any) -> list[str]:
+def said(
+    monkeypatch: pytest.MonkeyPatch, make: Make, memory: int | None, free: int, parameters: int = 10**6, **given: Any
+) -> list[str]:
     monkeypatch.setattr(forecast, "machine_memory", lambda: memory)
     monkeypatch.setattr(forecast.shutil, "disk_usage", lambda path: Usage(0, 0, free))
     spaces = translate(train_fakes.Counting.observation_space, train_fakes.Counting.action_space).spaces
@@ -44,7 +46,9 @@ def test_a_run_says_what_it_needs(make: Make, monkeypatch: pytest.MonkeyPatch) -
     assert "30 records" in said(monkeypatch, make, None, 2**40, action_repeat=2)[0]
 
 
-def test_too_little_memory_or_disk_is_a_warning_that_names_the_remedy(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_little_memory_or_disk_is_a_warning_that_names_the_remedy(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
     _, warning = said(monkeypatch, make, 1200, 2**40, parameters=10)
     for words in ("WARNING", "1.17 KiB", "--size", "--replay-memory"):
         assert words in warning
@@ -75,7 +79,9 @@ def test_the_time_is_measured_on_the_steps_that_follow_the_first_and_said_once()
     timer.attend(run)  # The measurement begins: what came before, with its compilation, does not count.
     for _ in range(3):
         now += 5
-        run.counters = dataclasses.replace(run.counters, records=run.counters.records + 50, train_steps=run.counters.train_steps + 5)
+        run.counters = dataclasses.replace(
+            run.counters, records=run.counters.records + 50, train_steps=run.counters.train_steps + 5
+        )
         run.step = 2 * run.counters.records
         timer.attend(run)
     assert run.said == ["at 20 steps/s the 97,800 steps that are left of 100,000 take 1 h 21 min, without evaluations"]

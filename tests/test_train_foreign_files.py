@@ -1,4 +1,5 @@
-"""What others have put into a log directory, what is away for a moment, and what cannot be read: nothing of it is changed."""
+"""What others have put into a log directory, what is away for a moment, and what cannot be read: nothing of it is
+changed."""
 
 import errno
 import json
@@ -19,12 +20,12 @@ from train_fakes import FakeLearner
 from train_runs import Make, run_quietly
 
 from conformance.problems import small_config
+from dreamer_spec import checkpoint, files, forecast, loop
+from dreamer_spec.cli import main
+from dreamer_spec.errors import UserError
+from dreamer_spec.files import Unreadable
+from dreamer_spec.replay import Replay
 from spec import Spaces, Vector
-from train import checkpoint, files, forecast, loop
-from train.cli import main
-from train.errors import UserError
-from train.files import Unreadable
-from train.replay import Replay
 
 CONFIG = small_config("paper", "float32")
 TASK = Spaces({"position": Vector(3)}, {"arm": Vector(2)})
@@ -53,12 +54,36 @@ def refused(options: Any) -> str:
 
 NAMES = [
     *("metrics.jsonl", "run.json", "curve.png", "replay/chunk-0000000000.bin", "replay/saved-0000000001.safetensors"),
-    *("checkpoints/000000000060/x", "predictions/000000000001-x.png", "nonfinite/000000000001/x", "replay/journal-0000000001.bin"),
+    *(
+        "checkpoints/000000000060/x",
+        "predictions/000000000001-x.png",
+        "nonfinite/000000000001/x",
+        "replay/journal-0000000001.bin",
+    ),
 ]
 HARMLESS = [
-    *("notes.txt", "replay/chunk-²³.bin", "replay/chunk-0000000001.bin.bak", "replay/saved-mine.txt", "checkpoints/best/weights.bin"),
-    *("checkpoints/000000000060.mine", "predictions/mine.png", "run.tmp", "metrics.jsonl.tmp", ".hydra/config.yaml", "slurm-1.out"),
-    *("checkpoints/000000000060.tmp", "replay/saved-0000000001.tmp", "nonfinite/000000000001.tmp", "policy.tmp/x", "replay/mine/x"),
+    *(
+        "notes.txt",
+        "replay/chunk-²³.bin",
+        "replay/chunk-0000000001.bin.bak",
+        "replay/saved-mine.txt",
+        "checkpoints/best/weights.bin",
+    ),
+    *(
+        "checkpoints/000000000060.mine",
+        "predictions/mine.png",
+        "run.tmp",
+        "metrics.jsonl.tmp",
+        ".hydra/config.yaml",
+        "slurm-1.out",
+    ),
+    *(
+        "checkpoints/000000000060.tmp",
+        "replay/saved-0000000001.tmp",
+        "nonfinite/000000000001.tmp",
+        "policy.tmp/x",
+        "replay/mine/x",
+    ),
 ]
 
 
@@ -191,7 +216,9 @@ def test_an_export_and_a_report_spare_their_neighbours(tmp_path: Path) -> None:
 
 
 @pytest.mark.covers("LOOP-50", "REP-35")
-@pytest.mark.parametrize("left", ["nothing", "an empty folder", "a file of somebody else", "a file", "a link to nowhere"])
+@pytest.mark.parametrize(
+    "left", ["nothing", "an empty folder", "a file of somebody else", "a file", "a link to nowhere"]
+)
 def test_a_buffer_that_is_away_changes_nothing(make: Make, left: str) -> None:
     """As with a disk that is not mounted."""
     loop.run(make(), FakeLearner)
@@ -227,7 +254,11 @@ def test_a_buffer_that_is_lost_for_good_can_be_given_up(make: Make, capsys: pyte
 
 
 UNREADABLE = [
-    *("checkpoints/000000000060/run.json", "checkpoints/000000000060/learner.safetensors", "checkpoints/000000000060/SHA256SUMS"),
+    *(
+        "checkpoints/000000000060/run.json",
+        "checkpoints/000000000060/learner.safetensors",
+        "checkpoints/000000000060/SHA256SUMS",
+    ),
     *("replay/saved-", "replay/chunk-", "replay/journal-", "run.json"),
 ]
 
@@ -235,7 +266,9 @@ UNREADABLE = [
 @pytest.mark.covers("LOOP-50", "REP-35")
 @pytest.mark.parametrize("number", [errno.EACCES, errno.EIO, errno.ENOTDIR, errno.ESTALE])
 @pytest.mark.parametrize("name", UNREADABLE)
-def test_what_cannot_be_read_changes_nothing(make: Make, monkeypatch: pytest.MonkeyPatch, name: str, number: int) -> None:
+def test_what_cannot_be_read_changes_nothing(
+    make: Make, monkeypatch: pytest.MonkeyPatch, name: str, number: int
+) -> None:
     loop.run(make(steps=40), FakeLearner)
     loop.run(make(), FakeLearner)
     before = content(make().logdir)
@@ -248,7 +281,9 @@ def test_what_cannot_be_read_changes_nothing(make: Make, monkeypatch: pytest.Mon
             return real(path, flags, *arguments, **keywords)
 
         patch.setattr(os, "open", fail)
-        with pytest.raises(Unreadable, match=f"cannot read {make().logdir / name}.*{os.strerror(number)}.*Nothing was changed"):
+        with pytest.raises(
+            Unreadable, match=f"cannot read {make().logdir / name}.*{os.strerror(number)}.*Nothing was changed"
+        ):
             loop.run(make(steps=90), FakeLearner)
     after = content(make().logdir)
     assert after == before, [key for key in {**after, **before} if after.get(key) != before.get(key)]
@@ -257,7 +292,9 @@ def test_what_cannot_be_read_changes_nothing(make: Make, monkeypatch: pytest.Mon
 
 @pytest.mark.covers("LOOP-50")
 @pytest.mark.parametrize("folder", ["checkpoints", "checkpoints/000000000060"])
-def test_a_folder_that_cannot_be_looked_into_is_not_an_empty_one(make: Make, monkeypatch: pytest.MonkeyPatch, folder: str) -> None:
+def test_a_folder_that_cannot_be_looked_into_is_not_an_empty_one(
+    make: Make, monkeypatch: pytest.MonkeyPatch, folder: str
+) -> None:
     loop.run(make(), FakeLearner)
     before = content(make().logdir)
     with monkeypatch.context() as patch:
@@ -307,7 +344,9 @@ def test_a_checkpoint_that_is_replaced_while_it_is_read_is_not_damaged(tmp_path:
 # What a checkpoint says
 
 
-def edit(logdir: Path, info: Callable[[dict[str, Any]], None] | None = None, loop_arrays: dict[str, Any] | None = None) -> Path:
+def edit(
+    logdir: Path, info: Callable[[dict[str, Any]], None] | None = None, loop_arrays: dict[str, Any] | None = None
+) -> Path:
     """Changes the newest checkpoint, with checksums that agree."""
     [folder] = checkpoint.candidates(logdir)[:1]
     if info:
@@ -367,10 +406,16 @@ def test_arrays_that_no_run_has_are_refused_by_name(make: Make, what: str) -> No
         *(("counters/records", value) for value in (-1, 61, 60.0, True, 10**18, None)),
         *(("counters/seconds", value) for value in (-1.0, float("nan"), float("inf"), "1")),
         *(("counters/more", value) for value in (1,)),
-        *(("replay_ratio/credit", value) for value in ("1e9999999", "-1", "6", "1/0", "0x1", "١", "", 3, "9" * 2000, None)),
+        *(
+            ("replay_ratio/credit", value)
+            for value in ("1e9999999", "-1", "6", "1/0", "0x1", "١", "", 3, "9" * 2000, None)
+        ),
         *(("replay_ratio/step", value) for value in (0, 59, 61, 10**15, -1, "60", 60.0)),
         *(("returns", value) for value in ([float("nan")], [None], [1.0] * 1000, {})),
-        *(("evaluation", value) for value in ({"step": 0.5, "return": 1.0}, {"step": 1}, [], {"step": 1, "return": float("nan")})),
+        *(
+            ("evaluation", value)
+            for value in ({"step": 0.5, "return": 1.0}, {"step": 1}, [], {"step": 1, "return": float("nan")})
+        ),
         *(("metrics", value) for value in ({"x": [1.0, 0]}, {"x": [1.0]}, {"x": 1}, {"x": [1.0, 2, 3]})),
         *(("environments", value) for value in ({}, [3], [{"seed": -1, "episode": 0}], [{"seed": 0}])),
         *(("log", value) for value in (-1, 0.5, "0")),
@@ -432,12 +477,18 @@ def test_spaces_that_no_machine_holds_are_refused(make: Make, task: str) -> None
 
 def test_a_model_that_the_machine_cannot_hold_is_refused(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(forecast, "machine_memory", lambda: 10_000)
-    with pytest.raises(UserError, match=r"parameters and their optimizer take .*, and this machine gives 9\.77 KiB: .* smaller --size"):
+    with pytest.raises(
+        UserError, match=r"parameters and their optimizer take .*, and this machine gives 9\.77 KiB: .* smaller --size"
+    ):
         loop.run(make(), FakeLearner)
 
 
-@pytest.mark.parametrize("error", [MemoryError("Unable to allocate 8.00 EiB"), RuntimeError("RESOURCE_EXHAUSTED: Out of memory")])
-def test_too_little_memory_is_a_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], error: Exception) -> None:
+@pytest.mark.parametrize(
+    "error", [MemoryError("Unable to allocate 8.00 EiB"), RuntimeError("RESOURCE_EXHAUSTED: Out of memory")]
+)
+def test_too_little_memory_is_a_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], error: Exception
+) -> None:
     def fail(*_: Any) -> bool:
         raise error
 

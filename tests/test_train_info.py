@@ -8,11 +8,11 @@ import train_fakes
 from train_fakes import EPISODE, FakeLearner
 from train_runs import Make, logged
 
-from train import loop
-from train.envs import ContractEnv
-from train.envs.adapter import Garbage
-from train.envs.info import chosen, names_of
-from train.errors import UserError
+from dreamer_spec import loop
+from dreamer_spec.envs import ContractEnv
+from dreamer_spec.envs.adapter import Garbage
+from dreamer_spec.envs.info import chosen, names_of
+from dreamer_spec.errors import UserError
 
 
 class Judged(train_fakes.Counting):
@@ -21,7 +21,12 @@ class Judged(train_fakes.Counting):
     def step(self, action: np.ndarray) -> Any:
         *rest, _ = super().step(action)
         parts = {"alive": np.float32(0.5), "time": np.array([self._time])}
-        return *rest, {"is_success": self._episode % 2 == 0, "parts": parts, "name": "judged", "frame": np.zeros((3, 3))}
+        return *rest, {
+            "is_success": self._episode % 2 == 0,
+            "parts": parts,
+            "name": "judged",
+            "frame": np.zeros((3, 3)),
+        }
 
 
 class Broken(train_fakes.Counting):
@@ -29,7 +34,14 @@ class Broken(train_fakes.Counting):
         return *super().step(action)[:4], {"good": 1, "bad": np.nan if self._time == EPISODE else 0.0}
 
 
-INFO = {"a": 1, "b": True, "c": {"d": np.float64(2.5), "e": {"f": np.array([3])}}, "text": "x", "many": [1, 2], "none": None}
+INFO = {
+    "a": 1,
+    "b": True,
+    "c": {"d": np.float64(2.5), "e": {"f": np.array([3])}},
+    "text": "x",
+    "many": [1, 2],
+    "none": None,
+}
 
 
 @pytest.mark.parametrize(
@@ -77,14 +89,20 @@ def test_an_invalid_number_is_invalid_data_of_the_environment() -> None:
 
 @pytest.mark.parametrize("processes", ["no", "yes"])
 def test_they_are_logged_with_episodes_and_evaluations(make: Make, processes: str) -> None:
-    options = make(task="test_train_info:Judged", info_metrics="is_success,parts/*", eval_episodes=2, processes=processes, envs=2)
+    options = make(
+        task="test_train_info:Judged", info_metrics="is_success,parts/*", eval_episodes=2, processes=processes, envs=2
+    )
     loop.run(options, FakeLearner)
     episodes = [line for line in logged(options.logdir) if "episode/return" in line]
     assert len(episodes) > 2
     for line in episodes:
         number = (line["episode/return"] - EPISODE * (EPISODE + 1) / 2) / (10 * EPISODE)
         shown = {name: value for name, value in line.items() if name.startswith("episode/info/")}
-        assert shown == {"episode/info/is_success": number % 2 == 0, "episode/info/parts/alive": 0.5, "episode/info/parts/time": EPISODE}
+        assert shown == {
+            "episode/info/is_success": number % 2 == 0,
+            "episode/info/parts/alive": 0.5,
+            "episode/info/parts/time": EPISODE,
+        }
     (evaluation,) = [line for line in logged(options.logdir) if "evaluation/return" in line]
     assert evaluation["evaluation/info/is_success"] == 1.0, "each of two environments plays its first episode"
     assert evaluation["evaluation/info/parts/time"] == EPISODE

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dreamer_spec import checkpoint
+from dreamer_spec.cli import main
+from dreamer_spec.commands import inspect
+from dreamer_spec.nonfinite import save_incident
+from dreamer_spec.options import make_options
 from spec import Config, Discrete, Spaces, Vector
-from train import checkpoint
-from train.cli import main
-from train.commands import inspect
-from train.nonfinite import save_incident
-from train.options import make_options
 
 SPACES = Spaces({"position": Vector(2)}, {"action": Discrete((2,))})
 NAN, INF = float("nan"), float("inf")
@@ -60,7 +60,9 @@ def incident(
     """An incident in which nothing is wrong but what is given."""
     options = make_options("jax", {"task": "gym:CartPole-v1", "size": "tiny"}, identity)
     measured = METRICS | (metrics or {})
-    learner = Broken(STATE | (state or {}), GRADIENTS | (gradients or {}), measured if repeated is None else METRICS | repeated)
+    learner = Broken(
+        STATE | (state or {}), GRADIENTS | (gradients or {}), measured if repeated is None else METRICS | repeated
+    )
     info = {
         "train_step": 41,
         "step": 1300,
@@ -127,19 +129,37 @@ def test_a_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
             "finite parameters: loss/reward",
             "a smaller --learning-rate, or --nonfinite",
         ),
-        ({"metrics": {"loss/reward": NAN, "loss/total": NAN}, "compute_dtype": "bfloat16"}, "loss/reward", "--compute-dtype float32"),
-        ({"gradients": {"actor/out/bias": [NAN]}, "metrics": {"gradient_norm": NAN}}, "the gradients, on the way back", "smaller"),
         (
-            {"gradients": {"actor/out/bias": [NAN]}, "metrics": {"gradient_norm": NAN}, "state": {"params/actor/out/bias": [2e4]}},
+            {"metrics": {"loss/reward": NAN, "loss/total": NAN}, "compute_dtype": "bfloat16"},
+            "loss/reward",
+            "--compute-dtype float32",
+        ),
+        (
+            {"gradients": {"actor/out/bias": [NAN]}, "metrics": {"gradient_norm": NAN}},
+            "the gradients, on the way back",
+            "smaller",
+        ),
+        (
+            {
+                "gradients": {"actor/out/bias": [NAN]},
+                "metrics": {"gradient_norm": NAN},
+                "state": {"params/actor/out/bias": [2e4]},
+            },
             "the gradients",
             "parameters have grown, actor/out/bias to 2e+04",
         ),
-        ({"metrics": {"loss/reward": INF}, "batch": {"reward": np.float32([[0, -1e30]])}}, "losses", "reward reaches 1e+30"),
+        (
+            {"metrics": {"loss/reward": INF}, "batch": {"reward": np.float32([[0, -1e30]])}},
+            "losses",
+            "reward reaches 1e+30",
+        ),
         ({"metrics": {"gradient_norm": INF}}, "sums: the total loss or the norm of finite gradients", "smaller"),
         ({"metrics": {"gradient_norm": NAN}, "repeated": {}}, "nothing that could be repeated", "not deterministic"),
     ],
 )
-def test_where_it_began(tmp_path: Path, capsys: pytest.CaptureFixture[str], wrong: dict[str, Any], began: str, cause: str) -> None:
+def test_where_it_began(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], wrong: dict[str, Any], began: str, cause: str
+) -> None:
     out = printed(capsys, incident(tmp_path, **wrong))
     assert began in out.split("It began in")[1].split("Metrics not finite")[0]
     assert cause in out.split("Usual cause:")[1].split("Batch")[0]
@@ -160,8 +180,12 @@ def test_a_long_list_is_cut(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert "and 8 more" in out
 
 
-def test_a_rerun_that_gives_something_else(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    path = incident(tmp_path, gradients={"actor/out/bias": [NAN]}, metrics={"gradient_norm": NAN, "loss/total": NAN}, batch_size=3)
+def test_a_rerun_that_gives_something_else(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = incident(
+        tmp_path, gradients={"actor/out/bias": [NAN]}, metrics={"gradient_norm": NAN, "loss/total": NAN}, batch_size=3
+    )
     given: list[Any] = []
 
     class Repeating(Broken):
@@ -183,7 +207,8 @@ def test_a_rerun_that_gives_something_else(tmp_path: Path, capsys: pytest.Captur
     assert given == [SPACES, 3, "cuda:1", set(STATE), set(BATCH), 5]
     out = " ".join(capsys.readouterr().out.split())
     assert out.endswith(
-        "Rerun on cpu: other metrics and gradients are not finite. Only before: actor/out/bias, loss/total; only now: actor/out/kernel"
+        "Rerun on cpu: other metrics and gradients are not finite. Only before: actor/out/bias, loss/total; "
+        "only now: actor/out/kernel"
     )
 
 
@@ -208,7 +233,10 @@ def test_checkpoints(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     for words in (
         f"{path} records 4000, train steps 77 1 of 7 tensors hold numbers that are not finite",
         "state optimizer/momentum/actor/out/bias 1 NaN 1",
-        "optimizer/momentum 2 2 2 2 50.00% params/actor 3 -0.25 0.5 0.3227 0 params/rssm 1 1.5 1.5 1.5 0 return_range/low 1 0 0 0 0",
+        (
+            "optimizer/momentum 2 2 2 2 50.00% params/actor 3 -0.25 0.5 0.3227 0 params/rssm 1 1.5 1.5 1.5 0 "
+            "return_range/low 1 0 0 0 0"
+        ),
         "slow_critic 1 -3 -3 3 0",
         "rssm/gru/kernel 1.5 1.5",
     ):
@@ -242,11 +270,16 @@ def test_what_is_neither(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     ],
 )
 def test_incidents_that_cannot_be_repeated(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, entry: str | None, value: Any, words: str
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    entry: str | None,
+    value: Any,
+    words: str,
 ) -> None:
     path = incident(tmp_path, metrics={"loss/total": NAN})
     if entry:
         content = json.loads((path / "incident.json").read_text())
         (path / "incident.json").write_text(json.dumps({**content, entry: value}))
-        monkeypatch.setattr("train.nonfinite.require_intact", lambda folder, names: None)
+        monkeypatch.setattr("dreamer_spec.nonfinite.require_intact", lambda folder, names: None)
     assert words in refused(capsys, path, "--rerun")

@@ -1,4 +1,5 @@
-"""Real runs, killed with SIGKILL at random moments and started again: in the end everything is bit for bit as if nothing had happened."""
+"""Real runs, killed with SIGKILL at random moments and started again: in the end everything is bit for bit as if
+nothing had happened."""
 
 import json
 import os
@@ -15,8 +16,8 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file
 
-from train import checkpoint
-from train.replay import Replay
+from dreamer_spec import checkpoint
+from dreamer_spec.replay import Replay
 
 ROOT = Path(__file__).parent.parent
 STEPS = 900
@@ -28,14 +29,52 @@ pytestmark = pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGKILL"
 
 def command(backend: str, logdir: Path, *more: str) -> list[str]:
     sizes = [word for name, value in SMALL.items() for word in (f"--{name.replace('_', '-')}", str(value))]
-    run = ["--task", "gym:CartPole-v1", "--steps", str(STEPS), "--seed", "3", "--logdir", str(logdir), "--no-preflight", "--device", "cpu"]
-    schedule = ["--log-every", "0", "--eval-every", "300", "--eval-episodes", "2", "--random-episodes", "2", "--replay-ratio", "8"]
-    return [sys.executable, "-m", "train", "--backend", backend, *run, *schedule, "--replay-capacity", "300", *sizes, *more]
+    run = [
+        "--task",
+        "gym:CartPole-v1",
+        "--steps",
+        str(STEPS),
+        "--seed",
+        "3",
+        "--logdir",
+        str(logdir),
+        "--no-preflight",
+        "--device",
+        "cpu",
+    ]
+    schedule = [
+        "--log-every",
+        "0",
+        "--eval-every",
+        "300",
+        "--eval-episodes",
+        "2",
+        "--random-episodes",
+        "2",
+        "--replay-ratio",
+        "8",
+    ]
+    return [
+        sys.executable,
+        "-m",
+        "dreamer_spec",
+        "--backend",
+        backend,
+        *run,
+        *schedule,
+        "--replay-capacity",
+        "300",
+        *sizes,
+        *more,
+    ]
 
 
 def start(call: list[str], output: Path) -> "subprocess.Popen[bytes]":
     # Compiled once for all processes of a test: what is tested is the run, not the compiler.
-    cache = {"JAX_COMPILATION_CACHE_DIR": str(output.parent / "compiled"), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+    cache = {
+        "JAX_COMPILATION_CACHE_DIR": str(output.parent / "compiled"),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+    }
     with output.open("ab") as file:
         return subprocess.Popen(call, cwd=ROOT, stdout=file, stderr=subprocess.STDOUT, env={**os.environ, **cache})
 
@@ -50,7 +89,8 @@ def metrics(logdir: Path) -> list[dict[str, Any]]:
 
 
 def assert_same_run(logdir: Path, other: Path) -> None:
-    """Parameters, moments, records of the moment, carries, the batch drawn ahead, the whole buffer, counters and every line of metrics."""
+    """Parameters, moments, records of the moment, carries, the batch drawn ahead, the whole buffer, counters and every
+    line of metrics."""
     runs = [checkpoint.open_checkpoint(path) for path in (logdir, other)]
     for name in ("learner.safetensors", "loop.safetensors"):
         first, second = (load_file(run.path / name) for run in runs)
@@ -64,9 +104,14 @@ def assert_same_run(logdir: Path, other: Path) -> None:
     states = []
     for run, path in zip(runs, (logdir, other), strict=True):
         capacity, length, classes = 300, SMALL["batch_length"], SMALL["classes"]
-        replay = Replay.restore(path / "replay", run.info["replay"], capacity, length, continue_streams=True, classes=classes)
+        replay = Replay.restore(
+            path / "replay", run.info["replay"], capacity, length, continue_streams=True, classes=classes
+        )
         assert replay.warnings == []
-        states.append(replay.state_dict() | {"queue": np.array(replay.items.queue), "workers": np.array(list(replay.current.items()))})
+        states.append(
+            replay.state_dict()
+            | {"queue": np.array(replay.items.queue), "workers": np.array(list(replay.current.items()))}
+        )
     for key, array in states[0].items():
         np.testing.assert_array_equal(array, states[1][key], err_msg=key)
 
@@ -106,7 +151,10 @@ def test_many_killed_runs_continue_bit_by_bit(backend: str, tmp_path: Path) -> N
         resumed += kill_and_resume(backend, 10, tmp_path / str(run), seed=run + 1)
         shutil.rmtree(tmp_path / str(run))
         print(
-            f"{backend}: {run + 1} runs, {10 * (run + 1)} kills, {resumed} times continued from a checkpoint, all equal bit by bit",
+            (
+                f"{backend}: {run + 1} runs, {10 * (run + 1)} kills, {resumed} times continued "
+                f"from a checkpoint, all equal bit by bit"
+            ),
             flush=True,
         )
     assert resumed > 50
@@ -127,7 +175,8 @@ sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 
 
 def test_a_closed_terminal_saves_and_leaves(tmp_path: Path) -> None:
-    """As when a connection is lost: the signal comes from the system, and nothing can be written to the terminal any more."""
+    """As when a connection is lost: the signal comes from the system, and nothing can be written to the terminal any
+    more."""
     call, output = command("torch", tmp_path / "run", "--checkpoint-every", "1e9"), tmp_path / "output.txt"
     log = tmp_path / "run" / "metrics.jsonl"
     assert start([sys.executable, "-c", HANG_UP, str(log), "20000", *call], output).wait() == 130, output.read_text()

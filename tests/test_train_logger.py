@@ -15,9 +15,9 @@ from PIL import Image
 from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from train import logger as module
-from train.errors import UserError
-from train.logger import Display, Logger, iterate_metrics
+from dreamer_spec import logger as module
+from dreamer_spec.errors import UserError
+from dreamer_spec.logger import Display, Logger, iterate_metrics
 
 ABOUT = {
     **dict.fromkeys(("task", "backend", "device", "profile", "size", "parameters", "command", "machine"), "-"),
@@ -130,7 +130,8 @@ def test_a_full_disk_under_tensorboard_is_a_user_error(tmp_path: Path, monkeypat
 def test_damaged_lines_are_left_out(tmp_path: Path) -> None:
     path = tmp_path / "metrics.jsonl"
     path.write_bytes(
-        b'{"step": 1, "a": NaN}\n\xff\xfe\n[1]\n{"a": 1}\n{"step": "x"}\n{"step": 2, "a": "text", "b": true}\n{"step": Infinity}\n'
+        b'{"step": 1, "a": NaN}\n\xff\xfe\n[1]\n{"a": 1}\n{"step": "x"}\n{"step": 2, "a": "text", "b": '
+        b'true}\n{"step": Infinity}\n'
         b'{"step": -1}\n{"step": 3, "seconds": NaN}\n{"step": 3, "a": 1' + b"0" * 400 + b'}\n{"st'
     )
     lines = [line for line in iterate_metrics(path) if line is not None]
@@ -151,7 +152,9 @@ def test_tensorboard_hides_what_a_resumed_run_does_again(tmp_path: Path) -> None
     position = write(tmp_path, range(5))
     write(tmp_path, range(5, 9), position=position)
     write(tmp_path, range(5, 7), position=position)
-    assert [(event.step, event.value) for event in events(tmp_path).Scalars("train/loss/total")] == [(step, step) for step in range(7)]
+    assert [(event.step, event.value) for event in events(tmp_path).Scalars("train/loss/total")] == [
+        (step, step) for step in range(7)
+    ]
 
 
 def test_pictures_come_to_tensorboard_as_they_are(tmp_path: Path) -> None:
@@ -303,9 +306,13 @@ class Broken(io.StringIO):
 
 
 @pytest.mark.parametrize("terminal", [False, True])
-@pytest.mark.parametrize("error", [BrokenPipeError(), OSError(28, "No space left on device"), ValueError("I/O operation on closed file")])
+@pytest.mark.parametrize(
+    "error", [BrokenPipeError(), OSError(28, "No space left on device"), ValueError("I/O operation on closed file")]
+)
 @pytest.mark.covers("LOOP-45")
-def test_a_display_that_nobody_can_see_goes_on(monkeypatch: pytest.MonkeyPatch, error: Exception, terminal: bool) -> None:
+def test_a_display_that_nobody_can_see_goes_on(
+    monkeypatch: pytest.MonkeyPatch, error: Exception, terminal: bool
+) -> None:
     file = Broken(error)
     monkeypatch.setattr(module, "Console", lambda: Console(file=file, width=100))
     monkeypatch.setattr(file, "isatty", lambda: terminal)

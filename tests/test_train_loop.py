@@ -1,4 +1,5 @@
-"""The loop of `train` with a learner that keeps a diary: what is stored, when it trains, what a checkpoint carries over."""
+"""The loop of `train` with a learner that keeps a diary: what is stored, when it trains, what a checkpoint carries
+over."""
 
 from contextlib import ExitStack
 from typing import Any
@@ -9,11 +10,11 @@ import train_fakes
 from train_fakes import EPISODE, FakeLearner
 from train_runs import BATCH_STEPS, SMALL, Make, batches, logged, run_quietly, stored
 
+from dreamer_spec import checkpoint, evaluation, loop, setup
+from dreamer_spec.envs import ContractEnv, Environments, make_env
+from dreamer_spec.errors import UserError
+from dreamer_spec.nonfinite import load_incident, newest_incident
 from reference_numpy.training_loop import derive_seed
-from train import checkpoint, evaluation, loop, setup
-from train.envs import ContractEnv, Environments, make_env
-from train.errors import UserError
-from train.nonfinite import load_incident, newest_incident
 
 # What is stored
 
@@ -31,12 +32,17 @@ def test_streams_hold_every_observation_with_what_arrived_with_it(make: Make) ->
         assert stream["is_first"].tolist() == (time == 0).tolist()
         assert stream["is_last"].tolist() == (time == EPISODE).tolist()
         assert stream["is_terminal"].tolist() == ((time == EPISODE) & (episode % 2 == 0)).tolist()
-        # The latents that the policy step made for this observation: its row's steps since the reset, the seed of the call.
+        # The latents that the policy step made for this observation: its row's steps since the reset, the seed of the
+        # call.
         seeds = [derive_seed(0, "policy", call) for call in range(30)]
         assert stream["deter"][:, 0].tolist() == time.tolist()
         assert stream["deter"][:, 1].tolist() == np.float32(seeds).tolist()
-        expected = [3 * evaluation.random_actions(state.envs.spaces, np.random.default_rng(seed), 2)[worker] for seed in seeds]
-        assert stream["action"].tolist() == np.where((time == EPISODE)[:, None], 0, expected).tolist(), "raw, and zeros at the end"
+        expected = [
+            3 * evaluation.random_actions(state.envs.spaces, np.random.default_rng(seed), 2)[worker] for seed in seeds
+        ]
+        assert stream["action"].tolist() == np.where((time == EPISODE)[:, None], 0, expected).tolist(), (
+            "raw, and zeros at the end"
+        )
     assert np.abs(streams[0]["action"]).max() > 1, "the test needs actions that would be clipped"
 
 
@@ -111,7 +117,9 @@ def test_latents_are_written_back_before_the_next_draw_but_one(make: Make) -> No
     seen = 0
     for number, batch in enumerate(batches()):
         contexts = batch["deter"][:, 0]
-        assert (contexts <= max(1000 + number - 1, EPISODE)).all(), "latents of a train step that was not complete when the batch was drawn"
+        assert (contexts <= max(1000 + number - 1, EPISODE)).all(), (
+            "latents of a train step that was not complete when the batch was drawn"
+        )
         assert ((contexts > 1000) | (contexts <= EPISODE)).all()
         seen += int((contexts == 1000 + number - 1).sum())
     assert seen > 10, "no batch saw the latents of the train step but one before"
@@ -132,12 +140,15 @@ def test_evaluation_plays_whole_episodes_and_changes_nothing(make: Make) -> None
     plain, _ = play(logdir=root / "b")
     evaluations = [line for line in lines if "evaluation/return" in line]
     assert [line["step"] for line in evaluations] == [20, 40]
-    # Workers 0 and 1 play their first episode, worker 0 its second: 1+2+3+4, the same, 11+12+13+14; then episodes go on counting.
+    # Workers 0 and 1 play their first episode, worker 0 its second: 1+2+3+4, the same, 11+12+13+14; then episodes go on
+    # counting.
     assert evaluations[0]["evaluation/return"] == pytest.approx((10 + 10 + 50) / 3)
     assert evaluations[0]["evaluation/return_max"] == 50
     assert state.counters.records == plain.counters.records
     assert state.counters.policy_steps == plain.counters.policy_steps
-    assert [stream["reward"].tolist() for stream in stored(state)] == [stream["reward"].tolist() for stream in stored(plain)]
+    assert [stream["reward"].tolist() for stream in stored(state)] == [
+        stream["reward"].tolist() for stream in stored(plain)
+    ]
 
 
 @pytest.mark.covers("LOOP-18", "LOOP-19", "LOOP-26")
@@ -219,7 +230,7 @@ def test_by_option_a_step_that_is_not_finite_is_skipped(make: Make, monkeypatch:
 
 
 def test_evaluation_refuses_an_action_that_is_not_finite(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("train.evaluation.Agent.__call__", lambda self, record: np.full((2, 2), np.nan))
+    monkeypatch.setattr("dreamer_spec.evaluation.Agent.__call__", lambda self, record: np.full((2, 2), np.nan))
     with pytest.raises(UserError, match="diverged: the policy's action"):
         loop.run(make(eval_episodes=2), FakeLearner)
 

@@ -11,17 +11,20 @@ import numpy as np
 import pytest
 
 from conformance.problems import random_batch, random_state, small_config, spaces
+from dreamer_spec.backend import Learner, learner_class
+from dreamer_spec.commands import inspect
+from dreamer_spec.errors import UserError
+from dreamer_spec.nonfinite import Tally, load_incident, newest_incident, offending, save_incident, stop_error, tally
 from reference_numpy import agent, optimizer
 from spec import parameter_table
-from train.backend import Learner, learner_class
-from train.commands import inspect
-from train.errors import UserError
-from train.nonfinite import Tally, load_incident, newest_incident, offending, save_incident, stop_error, tally
 
 pytestmark = pytest.mark.usefixtures("compile_once")
 
 TASK = spaces("vector", "discrete")
-LAYERS = {f"{part}_layers": 1 for part in ("encoder", "decoder", "posterior", "prior", "reward", "continue", "actor", "critic")}
+LAYERS = {
+    f"{part}_layers": 1
+    for part in ("encoder", "decoder", "posterior", "prior", "reward", "continue", "actor", "critic")
+}
 CONFIG = small_config("paper", "float32", **LAYERS)
 
 Arrays = dict[str, np.ndarray]
@@ -56,7 +59,8 @@ def batch(seed: int, **spoiled: float) -> Arrays:
 
 
 def steep() -> Arrays:
-    """A state of finite losses and infinite gradients: what the reward head normalizes is 0, and any change of it counts 10³⁸ fold."""
+    """A state of finite losses and infinite gradients: what the reward head normalizes is 0, and any change of it
+    counts 10³⁸ fold."""
     arrays = state()
     for name in ("kernel", "bias"):
         arrays[f"params/reward/hidden0/{name}"][...] = 0
@@ -132,7 +136,10 @@ def test_skipping_goes_on_as_if_the_step_had_not_been(skipping: Learner) -> None
         skipping.load_state_dict(state())
         skipped = [train(skipping, batch(0), 0)["skipped"]]
         if spoiled:
-            skipped += [train(skipping, batch(1, reward=np.inf), 1)["skipped"], train(skipping, batch(1, deter=np.inf), 2)["skipped"]]
+            skipped += [
+                train(skipping, batch(1, reward=np.inf), 1)["skipped"],
+                train(skipping, batch(1, deter=np.inf), 2)["skipped"],
+            ]
         skipped.append(train(skipping, batch(2), 3)["skipped"])
         assert skipped == ([0, 1, 1, 0] if spoiled else [0, 0])
         results.append(skipping.state_dict())
@@ -174,7 +181,14 @@ def test_another_word_for_what_to_do_is_refused(backend: str) -> None:
 
 def info(backend: str, metrics: Mapping[str, Any]) -> dict[str, Any]:
     identity = {"task": "gym:CartPole-v1", **dataclasses.asdict(CONFIG)}
-    return {"train_step": 41, "step": 1300, "backend": backend, "identity": identity, "spaces": TASK.to_json(), "metrics": metrics}
+    return {
+        "train_step": 41,
+        "step": 1300,
+        "backend": backend,
+        "identity": identity,
+        "spaces": TASK.to_json(),
+        "metrics": metrics,
+    }
 
 
 @pytest.fixture
@@ -195,7 +209,13 @@ def test_an_incident_comes_back_as_it_was_and_repeats(
     incident = load_incident(found)
     assert_same(incident.state, state())
     assert_same(incident.batch, batch(0, reward=np.inf))
-    assert [incident.info[name] for name in ("train_step", "step", "seed", "backend", "device")] == [41, 1300, 9, backend, "cpu"]
+    assert [incident.info[name] for name in ("train_step", "step", "seed", "backend", "device")] == [
+        41,
+        1300,
+        9,
+        backend,
+        "cpu",
+    ]
     assert incident.info["versions"].keys() >= {"python", "numpy", backend}
     assert np.isnan([incident.metrics["loss/replay_critic"], incident.metrics["loss/total"]]).all()
     assert [one for one in incident.tallies if one.kind != "gradient"] == [
@@ -227,7 +247,13 @@ def test_a_disk_that_refuses(stopping: Learner, backend: str, tmp_path: Path) ->
 
 @pytest.mark.covers("LOOP-41")
 def test_what_a_run_ends_with_names_the_incident() -> None:
-    metrics = {"loss/total": np.nan, "loss/reward": 1.0, "loss/actor": np.inf, "gradient_norm": np.nan, "return_scale": -np.inf}
+    metrics = {
+        "loss/total": np.nan,
+        "loss/reward": 1.0,
+        "loss/actor": np.inf,
+        "gradient_norm": np.nan,
+        "return_scale": -np.inf,
+    }
     words = str(stop_error(Path("runs/x/nonfinite/000000000041"), info("jax", metrics)))
     assert "train step 41 (step 1300), not finite: loss/total, loss/actor, gradient_norm and 1 more." in words
     assert "`train inspect runs/x/nonfinite/000000000041`" in words
@@ -287,6 +313,6 @@ def test_incidents_that_say_something_else_are_refused(
     copy = Path(shutil.copytree(intact, tmp_path / "incident"))
     content = json.loads((copy / "incident.json").read_text())
     (copy / "incident.json").write_text(json.dumps({**content, entry: value}))
-    monkeypatch.setattr("train.nonfinite.require_intact", lambda folder, names: None)
+    monkeypatch.setattr("dreamer_spec.nonfinite.require_intact", lambda folder, names: None)
     with pytest.raises(UserError, match=words):
         load_incident(copy)

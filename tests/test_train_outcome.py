@@ -11,20 +11,28 @@ import pytest
 from train_fakes import FakeLearner
 from train_runs import SMALL, Make, logged
 
-import train.setup
-from train import loop, outcome
-from train.checkpoint import candidates, open_checkpoint
-from train.cli import main, parse, parse_runs
-from train.errors import UserError
-from train.outcome import Mean, Outcome, first_train_step, last_words, mean_of, read_outcome, summary
+import dreamer_spec.setup
+from dreamer_spec import loop, outcome
+from dreamer_spec.checkpoint import candidates, open_checkpoint
+from dreamer_spec.cli import main, parse, parse_runs
+from dreamer_spec.errors import UserError
+from dreamer_spec.outcome import Mean, Outcome, first_train_step, last_words, mean_of, read_outcome, summary
 
-FAST = ["--backend=jax", "--size=tiny", "--no-preflight", "--steps=60", "--eval-every=0", "--eval-episodes=2", "--random-episodes=2"]
+FAST = [
+    "--backend=jax",
+    "--size=tiny",
+    "--no-preflight",
+    "--steps=60",
+    "--eval-every=0",
+    "--eval-episodes=2",
+    "--random-episodes=2",
+]
 FAST += [f"--{name.replace('_', '-')}={value}" for name, value in SMALL.items()]
 
 
 @pytest.fixture
 def fakes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(train.setup, "learner_class", lambda backend: FakeLearner)
+    monkeypatch.setattr(dreamer_spec.setup, "learner_class", lambda backend: FakeLearner)
     monkeypatch.chdir(tmp_path)
 
 
@@ -35,7 +43,10 @@ def test_the_error_of_a_ratio_is_that_of_many_ratios() -> None:
     """Drawn again and again, means scatter as the propagated error says."""
     rng = np.random.default_rng(0)
     scores, randoms = rng.normal(80, 30, (4000, 20)), rng.normal(20, 8, (4000, 20))
-    found = [Outcome(mean_of(list(score)), mean_of(list(random))).ratio for score, random in zip(scores, randoms, strict=True)]
+    found = [
+        Outcome(mean_of(list(score)), mean_of(list(random))).ratio
+        for score, random in zip(scores, randoms, strict=True)
+    ]
     ratios = np.array([ratio.value for ratio in found if ratio])
     errors = np.array([ratio.error for ratio in found if ratio and ratio.error is not None])
     assert len(ratios) == len(errors) == 4000
@@ -45,10 +56,16 @@ def test_the_error_of_a_ratio_is_that_of_many_ratios() -> None:
 @pytest.mark.parametrize(
     ("result", "words"),
     [
-        (Outcome(Mean(187.3, 4.23), Mean(22.1, 1.3)), "return 187.3 ± 4.2, random 22.1 ± 1.3, ratio 8.475 ± 0.53 after 1,226 train steps"),
+        (
+            Outcome(Mean(187.3, 4.23), Mean(22.1, 1.3)),
+            "return 187.3 ± 4.2, random 22.1 ± 1.3, ratio 8.475 ± 0.53 after 1,226 train steps",
+        ),
         (Outcome(Mean(50, None), Mean(10, None)), "return 50, random 10, ratio 5 after 1,226 train steps"),
         (Outcome(Mean(50, None), None), "return 50 after 1,226 train steps"),
-        (Outcome(Mean(5, 0.5), Mean(0.3, 0.2)), "return 5 ± 0.5, random 0.3 ± 0.2 after 1,226 train steps"),  # may be 0 as well
+        (
+            Outcome(Mean(5, 0.5), Mean(0.3, 0.2)),
+            "return 5 ± 0.5, random 0.3 ± 0.2 after 1,226 train steps",
+        ),  # may be 0 as well
         (Outcome(Mean(-5, 0.5), Mean(-9, 0.2)), "return -5 ± 0.5, random -9 ± 0.2 after 1,226 train steps"),
         (Outcome(None, Mean(9, 1)), "no episode has ended yet after 1,226 train steps"),
     ],
@@ -76,7 +93,9 @@ def test_the_outcome_is_that_of_the_newest_evaluation_or_of_the_last_episodes(ma
 
 @pytest.mark.covers("LOOP-13")
 @pytest.mark.parametrize(("envs", "batch_length", "action_repeat"), [(1, 3, 1), (2, 3, 1), (3, 2, 2), (4, 5, 1)])
-def test_the_first_train_step_is_where_it_is_said_to_be(make: Make, envs: int, batch_length: int, action_repeat: int) -> None:
+def test_the_first_train_step_is_where_it_is_said_to_be(
+    make: Make, envs: int, batch_length: int, action_repeat: int
+) -> None:
     """One step of the environments less, and there is none."""
     given = {"envs": envs, "batch_length": batch_length, "action_repeat": action_repeat, "task": "train_fakes:Endless"}
     first = first_train_step(make(**given))
@@ -90,10 +109,17 @@ def test_the_first_train_step_is_where_it_is_said_to_be(make: Make, envs: int, b
 def test_a_run_without_train_steps_says_so_and_why(make: Make, capsys: pytest.CaptureFixture[str]) -> None:
     loop.run(make(steps=8, eval_episodes=2, random_episodes=2), FakeLearner)
     lines = capsys.readouterr().out.splitlines()
-    why = "training starts at step 12, when the buffer holds batch_size x batch_length = 6 sequences, and --steps is 8: raise --steps, or"
-    (before,) = [number for number, line in enumerate(lines) if line.startswith(f"WARNING: no train step will be made: {why}")]
+    why = (
+        "training starts at step 12, when the buffer holds batch_size x batch_length = 6 sequences, and "
+        "--steps is 8: raise --steps, or"
+    )
+    (before,) = [
+        number for number, line in enumerate(lines) if line.startswith(f"WARNING: no train step will be made: {why}")
+    ]
     (after,) = [
-        number for number, line in enumerate(lines) if line.startswith(f"WARNING: no train step was made, the agent is as it began: {why}")
+        number
+        for number, line in enumerate(lines)
+        if line.startswith(f"WARNING: no train step was made, the agent is as it began: {why}")
     ]
     assert before < after
     assert lines[-1].endswith("after 0 train steps")
@@ -113,7 +139,21 @@ def test_a_replay_ratio_of_0_is_why(make: Make, capsys: pytest.CaptureFixture[st
 
 def test_the_commands_that_are_named_run_as_they_are_printed(tmp_path: Path) -> None:
     """From the shell, with the program and the paths of the lines."""
-    words = ["train", "--backend", "torch", "--size", "tiny", "--steps", "900", "--envs", "2", "--batch-size", "4", "--batch-length", "8"]
+    words = [
+        "train",
+        "--backend",
+        "torch",
+        "--size",
+        "tiny",
+        "--steps",
+        "900",
+        "--envs",
+        "2",
+        "--batch-size",
+        "4",
+        "--batch-length",
+        "8",
+    ]
     words += [
         "--task",
         "gym:CartPole-v1",
@@ -148,15 +188,16 @@ def test_the_program_is_named_as_the_shell_finds_it(monkeypatch: pytest.MonkeyPa
     assert outcome.program() == str(program)
     monkeypatch.setenv("PATH", str(tmp_path))
     assert outcome.program() == "train"
-    monkeypatch.setattr(sys, "argv", ["/somewhere/train/__main__.py"])
-    assert outcome.program() == f"{sys.executable} -m train"
+    monkeypatch.setattr(sys, "argv", ["/somewhere/dreamer_spec/__main__.py"])
+    assert outcome.program() == f"{sys.executable} -m dreamer_spec"
 
 
 # Several seeds
 
 
 @pytest.mark.parametrize(
-    ("text", "seeds"), [("0-4", [0, 1, 2, 3, 4]), ("0,2,5", [0, 2, 5]), ("7", [7]), ("3,0-1", [3, 0, 1]), ("0, 1", [0, 1])]
+    ("text", "seeds"),
+    [("0-4", [0, 1, 2, 3, 4]), ("0,2,5", [0, 2, 5]), ("7", [7]), ("3,0-1", [3, 0, 1]), ("0, 1", [0, 1])],
 )
 def test_lists_of_seeds(text: str, seeds: list[int]) -> None:
     runs = parse_runs(["--backend", "torch", "--seeds", text])
@@ -233,7 +274,9 @@ def test_one_seed_that_fails_does_not_lose_the_others(
     captured = capsys.readouterr()
     assert "seed 1 failed; runs/train_fakes-Counting-jax-seed1" in captured.out.splitlines()
     assert captured.out.splitlines()[-1].startswith("2 seeds: return ")
-    assert ("train: error: seed 1: the disk is full" if isinstance(error, UserError) else "RuntimeError: out of memory") in captured.err
+    assert (
+        "train: error: seed 1: the disk is full" if isinstance(error, UserError) else "RuntimeError: out of memory"
+    ) in captured.err
     assert len(candidates(Path("runs/train_fakes-Counting-jax-seed2"))) > 0
 
 

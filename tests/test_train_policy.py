@@ -17,12 +17,12 @@ from train_agents import random_learner_state, save_checkpoint
 
 from conformance.adapters import jax_adapter, torch_adapter
 from conformance.problems import action_noise, random_observations, small_config, uniforms
+from dreamer_spec.cli import main
+from dreamer_spec.envs import translate
+from dreamer_spec.errors import UserError
+from dreamer_spec.policy import Policy
 from reference_numpy.training_loop import derive_seed
 from spec import Discrete, Image, Spaces, Vector, load_config
-from train.cli import main
-from train.envs import translate
-from train.errors import UserError
-from train.policy import Policy
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCUMENT = (ROOT / "docs" / "policy.md").read_text(encoding="utf-8")
@@ -36,7 +36,9 @@ ROWS = 4
 
 @pytest.fixture(scope="module")
 def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return save_checkpoint(tmp_path_factory.mktemp("run"), CONFIG, TASK, task="gym:Robot-v0", seed=3, action_repeat=2, image_size=16)
+    return save_checkpoint(
+        tmp_path_factory.mktemp("run"), CONFIG, TASK, task="gym:Robot-v0", seed=3, action_repeat=2, image_size=16
+    )
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +78,14 @@ def test_a_policy_holds_what_acting_needs_and_nothing_else(checkpoint: Path, fol
 def test_a_policy_says_what_it_is_and_where_it_comes_from(checkpoint: Path, folder: Path) -> None:
     info = json.loads((folder / "policy.json").read_text())
     named = {name: info[name] for name in ("format", "task", "step", "backend", "action_repeat", "image_size")}
-    assert named == {"format": 2, "task": "gym:Robot-v0", "step": 1000, "backend": "jax", "action_repeat": 2, "image_size": 16}
+    assert named == {
+        "format": 2,
+        "task": "gym:Robot-v0",
+        "step": 1000,
+        "backend": "jax",
+        "action_repeat": 2,
+        "image_size": 16,
+    }
     assert info["source"] == {"checkpoint": str(checkpoint), "seed": 3, "train_steps": 10}
     assert set(info["versions"]) == {"dreamer-spec", "python", "numpy"}
     assert info["spaces"]["actions"]["buttons"] == {"kind": "discrete", "classes": [2, 3]}
@@ -102,7 +111,7 @@ def test_an_export_is_complete_or_absent(
         raise OSError("disk full")
 
     with monkeypatch.context() as patch:
-        patch.setattr("train.files.flush", fail)
+        patch.setattr("dreamer_spec.files.flush", fail)
         assert main(["export", str(checkpoint), str(tmp_path / "policy")]) == 2
     assert "disk full" in capsys.readouterr().err
     assert not (tmp_path / "policy").exists()
@@ -121,7 +130,7 @@ class Missing:
             raise ModuleNotFoundError(name)
 sys.meta_path.insert(0, Missing())
 import numpy as np
-from train.policy import Policy
+from dreamer_spec.policy import Policy
 policy = Policy.load(sys.argv[1])
 policy.reset({ROWS}, seed=5)
 for step in range(2):
@@ -148,10 +157,13 @@ def test_numpy_is_enough(folder: Path, policy: Policy, tmp_path: Path) -> None:
 @pytest.mark.covers("AGT-11", "AGT-12", "AGT-13", "CON-12", "LOOP-8")
 @pytest.mark.parametrize("adapter", [jax_adapter, torch_adapter], ids=["jax", "torch"])
 def test_its_actions_are_those_of_the_backends(policy: Policy, adapter: Any) -> None:
-    """The same noise over several steps, with resets of single rows in between: same choices, same numbers up to float32."""
+    """The same noise over several steps, with resets of single rows in between: same choices, same numbers up to
+    float32."""
     backend, rng = adapter.make_adapter("float32", "cpu"), np.random.default_rng(1)
     params = {
-        name.removeprefix("params/"): array for name, array in random_learner_state(CONFIG, TASK, 3).items() if name.startswith("params/")
+        name.removeprefix("params/"): array
+        for name, array in random_learner_state(CONFIG, TASK, 3).items()
+        if name.startswith("params/")
     }
     carry = {"deter": np.zeros((ROWS, CONFIG.deter)), "stoch": np.zeros((ROWS, CONFIG.stoch, CONFIG.classes))}
     expected, seen = np.zeros((ROWS, TASK.action_size)), []
@@ -193,7 +205,8 @@ def test_real_numbers_are_float32_as_in_training(policy: Policy) -> None:
     noise = {"posterior": np.full((ROWS, CONFIG.stoch), 0.5), "action": np.full((ROWS, 4), 0.5)}
     precise = observation() | {"position": np.full((ROWS, 3), 0.1)}
     actions = [
-        policy(given, [True] * ROWS, noise) for given in (precise, precise | {"position": np.full((ROWS, 3), np.float32(0.1), np.float64)})
+        policy(given, [True] * ROWS, noise)
+        for given in (precise, precise | {"position": np.full((ROWS, 3), np.float32(0.1), np.float64)})
     ]
     np.testing.assert_array_equal(*actions)
 
@@ -238,13 +251,18 @@ WRONG = [
     ({"mode": np.zeros((4, 2))}, "observation 'mode': a Discrete needs an integer dtype, got float64"),
     ({"mode": np.full((4, 2), 2)}, r"observation 'mode', entry 1: expected values in 0 .. 1, got 2"),
     ({"image": np.zeros((4, 16, 16, 3))}, "observation 'image': an Image needs the dtype uint8, got float64"),
-    ({"image": np.zeros((4, 16, 32, 3), np.uint8)}, r"observation 'image': expected shape \[4, 16, 16, 3\], got \[4, 16, 32, 3\]"),
+    (
+        {"image": np.zeros((4, 16, 32, 3), np.uint8)},
+        r"observation 'image': expected shape \[4, 16, 16, 3\], got \[4, 16, 32, 3\]",
+    ),
 ]
 
 
 @pytest.mark.covers("CON-8")
 @pytest.mark.parametrize(("change", "message"), WRONG)
-def test_a_wrong_observation_is_named_and_changes_nothing(policy: Policy, folder: Path, change: dict[str, Any], message: str) -> None:
+def test_a_wrong_observation_is_named_and_changes_nothing(
+    policy: Policy, folder: Path, change: dict[str, Any], message: str
+) -> None:
     wrong = {key: value for key, value in (observation() | change).items() if value is not None}
     with pytest.raises(ValueError, match=message):
         policy(wrong, [True] * ROWS)
@@ -258,9 +276,21 @@ def test_a_wrong_observation_is_named_and_changes_nothing(policy: Policy, folder
     [
         ([True] * 3, None, r"is_first: expected shape \[4\], got \[3\]"),
         ([1, 0, 0, 0], None, "is_first: expected the dtype bool, got int64"),
-        ([True] * 4, {"posterior": np.zeros((4, 2)), "action": np.zeros((4, 4))}, r"noise\['posterior'\]: expected shape \[4, 3\]"),
-        ([True] * 4, {"posterior": np.zeros((4, 3)), "action": np.zeros((4, 7))}, r"noise\['action'\]: expected shape \[4, 4\]"),
-        ([True] * 4, {"posterior": np.zeros((4, 3))}, r"noise: expected the entries posterior and action, got \['posterior'\]"),
+        (
+            [True] * 4,
+            {"posterior": np.zeros((4, 2)), "action": np.zeros((4, 4))},
+            r"noise\['posterior'\]: expected shape \[4, 3\]",
+        ),
+        (
+            [True] * 4,
+            {"posterior": np.zeros((4, 3)), "action": np.zeros((4, 7))},
+            r"noise\['action'\]: expected shape \[4, 4\]",
+        ),
+        (
+            [True] * 4,
+            {"posterior": np.zeros((4, 3))},
+            r"noise: expected the entries posterior and action, got \['posterior'\]",
+        ),
     ],
 )
 def test_a_wrong_call_is_named(policy: Policy, is_first: Any, noise: Any, message: str) -> None:
@@ -289,15 +319,22 @@ def blocks(language: str) -> list[str]:
 @pytest.fixture
 def cartpole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Where the document's commands are typed: the run that it speaks of has been trained, a little."""
-    config = load_config("paper", "tiny", compute_dtype="float32", deter=16, units=8, stoch=3, classes=5, bins=31, envs=4)
+    config = load_config(
+        "paper", "tiny", compute_dtype="float32", deter=16, units=8, stoch=3, classes=5, bins=31, envs=4
+    )
     task = Spaces({"observation": Vector(4)}, {"action": Discrete((2,))})
     save_checkpoint(tmp_path / "runs" / "CartPole-v1-jax-seed0", config, task, task="gym:CartPole-v1")
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
 
-ONLY = ("numpy", "safetensors", "gymnasium", *("typing_extensions", "farama_notifications", "cloudpickle"))  # Gymnasium's own needs
-OURS = ("train", "spec", "reference_numpy")
+ONLY = (
+    "numpy",
+    "safetensors",
+    "gymnasium",
+    *("typing_extensions", "farama_notifications", "cloudpickle"),
+)  # Gymnasium's own needs
+OURS = ("dreamer_spec", "spec", "reference_numpy")
 WITHOUT_THE_REST = f"""
 import sys
 class Missing:
@@ -312,7 +349,11 @@ sys.meta_path.insert(0, Missing())
 def robot_policy(folder: Path, side: int) -> None:
     """A policy for the robot of the document's example, with images of this side."""
     config = load_config("paper", "tiny", compute_dtype="float32")
-    seen = {"camera": gym.Box(0, 255, (64, 64, 3), np.uint8), "joints": gym.Box(-np.pi, np.pi, (5,)), "tool": gym.Discrete(3)}
+    seen = {
+        "camera": gym.Box(0, 255, (64, 64, 3), np.uint8),
+        "joints": gym.Box(-np.pi, np.pi, (5,)),
+        "tool": gym.Discrete(3),
+    }
     task = translate(gym.Dict(seen), gym.Dict({"torque": gym.Box(-2, 2, (5,)), "grip": gym.Discrete(2)}), side)
     run = save_checkpoint(folder / "run", config, task.spaces, translation=task, task="gym:Robot-v0", image_size=side)
     assert main(["export", str(run), str(folder / "policy")]) == 0
@@ -342,13 +383,20 @@ def test_the_commands_of_the_document_run(cartpole: Path, capsys: pytest.Capture
     for command in commands:
         assert main(command[1:]) == 0
     out = capsys.readouterr().out
-    assert len(re.findall(r"^return [\d.]+ ± [\d.]+ \(min \d+, max \d+\), length [\d.]+ \(min \d+, max \d+\)$", out, re.MULTILINE)) == 2
+    assert (
+        len(
+            re.findall(
+                r"^return [\d.]+ ± [\d.]+ \(min \d+, max \d+\), length [\d.]+ \(min \d+, max \d+\)$", out, re.MULTILINE
+            )
+        )
+        == 2
+    )
     assert len(json.loads((cartpole / "returns.json").read_text())["returns"]) == 100
     assert Policy.load("policy").info["task"] == "gym:CartPole-v1"
 
 
 def test_the_document_names_every_option_of_eval() -> None:
-    source = (ROOT / "train" / "commands" / "eval.py").read_text(encoding="utf-8")
+    source = (ROOT / "dreamer_spec" / "commands" / "eval.py").read_text(encoding="utf-8")
     options = set(re.findall(r'add_argument\(\s*"(--[a-z]+)"', source))
     section = DOCUMENT[DOCUMENT.index("## Evaluate") : DOCUMENT.index("## Export")]
     assert options == set(re.findall(r"`(--[a-z]+)", section))

@@ -11,20 +11,20 @@ import train_fakes
 from train_agents import random_learner_state, save_checkpoint
 from train_runs import logged
 
-import train.commands.eval
+import dreamer_spec.commands.eval
 from conformance.adapters import jax_adapter, torch_adapter
 from conformance.problems import Problem, random_batch, small_config, train_noise, with_sampling_margin
+from dreamer_spec import checkpoint
+from dreamer_spec.backend import learner_class
+from dreamer_spec.checkpoint import open_checkpoint
+from dreamer_spec.cli import main
+from dreamer_spec.commands.eval import sentence, summarize
+from dreamer_spec.envs import Environments, make_env
+from dreamer_spec.evaluation import Episode
+from dreamer_spec.replay import Replay
 from reference_numpy import agent as reference
 from reference_numpy.training_loop import derive_seed
 from spec import Config, Discrete, Image, Spaces, Vector, parameter_table
-from train import checkpoint
-from train.backend import learner_class
-from train.checkpoint import open_checkpoint
-from train.cli import main
-from train.commands.eval import sentence, summarize
-from train.envs import Environments, make_env
-from train.evaluation import Episode
-from train.replay import Replay
 
 pytestmark = pytest.mark.usefixtures("compile_once")
 
@@ -42,7 +42,11 @@ ROBOT = Spaces({"position": Vector(3), "image": Image(16, 16, 3)}, {"arm": Vecto
 def counting(tmp_path: Path) -> str:
     """Episode n of `Counting` has five records and the return 40 n + 10, whatever the agent does."""
     task = "train_fakes:Counting"
-    return str(save_checkpoint(tmp_path / "run", CONFIG, COUNTING, task=task, backend="torch", translation=make_env(task).translation))
+    return str(
+        save_checkpoint(
+            tmp_path / "run", CONFIG, COUNTING, task=task, backend="torch", translation=make_env(task).translation
+        )
+    )
 
 
 COUNT = ["--task", "train_fakes:Counting", "--episodes"]
@@ -56,7 +60,9 @@ def refusal(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
 
 
 @pytest.mark.covers("LOOP-20")
-def test_an_evaluation_says_returns_and_lengths(counting: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_evaluation_says_returns_and_lengths(
+    counting: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["eval", counting, *COUNT, "3", "--json", str(tmp_path / "result.json"), "--seed", "4"]) == 0
     first, second = capsys.readouterr().out.splitlines()
     assert first == f"{counting}: train_fakes:Counting, step 1,000; 3 episodes with torch on cpu, seed 4"
@@ -90,11 +96,18 @@ def test_either_backend_evaluates_what_the_other_trained(
     path = save_checkpoint(tmp_path / "run", CONFIG, CARTPOLE, task="gym:CartPole-v1", backend=trained_by)
     before = {file: file.read_bytes() for file in path.iterdir()}
     for name in ("a", "b"):
-        assert main(["eval", str(tmp_path / "run"), "--backend", backend, "--episodes", "2", "--json", str(tmp_path / name)]) == 0
+        assert (
+            main(
+                ["eval", str(tmp_path / "run"), "--backend", backend, "--episodes", "2", "--json", str(tmp_path / name)]
+            )
+            == 0
+        )
     assert f"2 episodes with {backend} on " in capsys.readouterr().out
     one, again = (json.loads((tmp_path / name).read_text()) for name in ("a", "b"))
     assert one == again, "the same seed gives the same episodes"
-    assert [length - 1 for length in one["lengths"]] == one["returns"], "CartPole pays 1 for every step, and the reset is a record"
+    assert [length - 1 for length in one["lengths"]] == one["returns"], (
+        "CartPole pays 1 for every step, and the reset is a record"
+    )
     assert {file: file.read_bytes() for file in path.iterdir()} == before
 
 
@@ -113,7 +126,9 @@ def test_seeds_are_not_those_of_the_runs_own_evaluations(counting: str, monkeypa
     assert not {derive_seed(0, "evaluation_environment", index) for index in range(10_000)}.intersection(given[0])
 
 
-def test_a_checkpoint_does_not_choose_which_code_runs(counting: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_checkpoint_does_not_choose_which_code_runs(
+    counting: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert "if you trust it, add --task train_fakes:Counting" in refusal(capsys, counting, "--episodes", "1")
     path = save_checkpoint(tmp_path / "other", CONFIG, CARTPOLE, task="gym:some_module:CartPole-v1")
     assert "runs code of that module" in refusal(capsys, str(path), "--episodes", "1")
@@ -134,15 +149,15 @@ def test_what_cannot_be_evaluated_is_named(counting: str, tmp_path: Path, capsys
 def test_an_action_that_is_not_finite_ends_the_evaluation(
     counting: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(train.commands.eval.Agent, "__call__", lambda self, record: np.full((1, 2), np.nan))
+    monkeypatch.setattr(dreamer_spec.commands.eval.Agent, "__call__", lambda self, record: np.full((1, 2), np.nan))
     assert "the action is not finite" in refusal(capsys, counting, *COUNT, "1")
 
 
 def test_an_evaluation_shows_its_progress_and_what_failed(
     counting: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("train.logger.PLAIN_EVERY", 0.0)
-    monkeypatch.setattr("train.envs.trial.SLOW_STEP", math.inf)  # So it is in this process.
+    monkeypatch.setattr("dreamer_spec.logger.PLAIN_EVERY", 0.0)
+    monkeypatch.setattr("dreamer_spec.envs.trial.SLOW_STEP", math.inf)  # So it is in this process.
     step, calls = train_fakes.Counting.step, []
 
     def fails_once(self: train_fakes.Counting, action: np.ndarray) -> Any:
@@ -158,10 +173,15 @@ def test_an_evaluation_shows_its_progress_and_what_failed(
 
 
 @pytest.mark.covers("LOOP-46")
-def test_an_environment_that_cannot_be_made_ends_the_evaluation(counting: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_environment_that_cannot_be_made_ends_the_evaluation(
+    counting: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["eval", counting, "--episodes", "1", "--task", "train_surroundings:Unmakeable"]) == 2
     *trace, line = capsys.readouterr().err.splitlines()
-    words = "task train_surroundings:Unmakeable, environment 0, when it was made: the environment raised SystemExit: 0 (3 attempts)"
+    words = (
+        "task train_surroundings:Unmakeable, environment 0, when it was made: the environment raised "
+        "SystemExit: 0 (3 attempts)"
+    )
     assert line == f"train: error: {words}"
     assert trace[0].startswith("Traceback")
     assert "train_surroundings.py" in "".join(trace)
@@ -200,11 +220,18 @@ def with_margin(state: dict[str, Any], seed: int, config: Config, spaces: Spaces
 
 @pytest.mark.covers("AGT-9", "AGT-29", "AGT-30", "AGT-31")
 def test_training_goes_on_in_the_other_backend(tmp_path: Path) -> None:
-    """Six train steps, the same batches and the same noise: on JAX, on PyTorch, and passed on after every second step. The losses are the
-    same within float32, and so is all of the training state after them."""
-    backends = {"jax": jax_adapter.make_adapter("float32", "cpu"), "torch": torch_adapter.make_adapter("float32", "cpu")}
+    """Six train steps, the same batches and the same noise: on JAX, on PyTorch, and passed on after every second step.
+    The losses are the same within float32, and so is all of the training state after them."""
+    backends = {
+        "jax": jax_adapter.make_adapter("float32", "cpu"),
+        "torch": torch_adapter.make_adapter("float32", "cpu"),
+    }
     table = parameter_table(CONFIG, ARM)
-    plans = {"stays on jax": ["jax"] * 6, "stays on torch": ["torch"] * 6, "changes": ["jax", "jax", "torch", "torch", "jax", "jax"]}
+    plans = {
+        "stays on jax": ["jax"] * 6,
+        "stays on torch": ["torch"] * 6,
+        "changes": ["jax", "jax", "torch", "torch", "jax", "jax"],
+    }
     states = dict.fromkeys(plans, random_learner_state(CONFIG, ARM))
     for step in range(6):
         problem = with_margin(reference.unflatten_state(states["changes"], table), step, CONFIG, ARM)
@@ -216,10 +243,14 @@ def test_training_goes_on_in_the_other_backend(tmp_path: Path) -> None:
         _, aux = reference.losses(*problem.loss_arguments)
         for name, expected in aux["losses"].items():
             for plan in plans:
-                np.testing.assert_allclose(losses[plan][name], expected, rtol=1e-4, atol=1e-5, err_msg=f"{name}, step {step}, {plan}")
+                np.testing.assert_allclose(
+                    losses[plan][name], expected, rtol=1e-4, atol=1e-5, err_msg=f"{name}, step {step}, {plan}"
+                )
     for plan in ("stays on jax", "stays on torch"):
         for name, array in states["changes"].items():
-            np.testing.assert_allclose(array, states[plan][name], rtol=1e-3, atol=1e-4 * np.abs(array).max(), err_msg=f"{name}, {plan}")
+            np.testing.assert_allclose(
+                array, states[plan][name], rtol=1e-3, atol=1e-4 * np.abs(array).max(), err_msg=f"{name}, {plan}"
+            )
     assert states["changes"]["optimizer/step"] == 16
 
 
@@ -232,8 +263,9 @@ RUN = {
 
 @pytest.mark.slow
 def test_a_run_that_changes_the_backend_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """CartPole for 300 steps on JAX, 300 on PyTorch, 300 on JAX again. Generators differ, so the losses cannot be equal: they lie no
-    further from those just before than these lie from each other. A learner that had begun anew would be far outside."""
+    """CartPole for 300 steps on JAX, 300 on PyTorch, 300 on JAX again. Generators differ, so the losses cannot be
+    equal: they lie no further from those just before than these lie from each other. A learner that had begun anew
+    would be far outside."""
     common = [f"--{name}={value}" for name, value in RUN.items()]
     for backend, steps in (("jax", 300), ("torch", 600), ("jax", 900)):
         assert main(["--backend", backend, f"--steps={steps}", f"--logdir={tmp_path}", "--no-preflight", *common]) == 0
@@ -247,13 +279,16 @@ def test_a_run_that_changes_the_backend_goes_on(tmp_path: Path, capsys: pytest.C
     assert counters["train_steps"] == 1 + (900 - (4 * 8 + 8)) * 16 // (4 * 8) == 431
     assert saved.info["replay_ratio"] == {"step": 900, "credit": "0"}
     with_latents = {"deter_dtype": saved.info["identity"]["replay_deter"], "classes": 4}
-    replay = Replay.restore(tmp_path / "replay", saved.info["replay"], saved.info["identity"]["replay_capacity"], 8, **with_latents)
+    replay = Replay.restore(
+        tmp_path / "replay", saved.info["replay"], saved.info["identity"]["replay_capacity"], 8, **with_latents
+    )
     assert len(replay.state_dict()["records/reward"]) == 900
 
     lines = [line for line in logged(tmp_path) if "train/loss/total" in line]
     assert len(lines) == 431
     losses = {
-        step: np.array([line["train/loss/total"] for line in lines if step < line["step"] <= step + 50]) for step in (250, 300, 550, 600)
+        step: np.array([line["train/loss/total"] for line in lines if step < line["step"] <= step + 50])
+        for step in (250, 300, 550, 600)
     }
     for before, after in ((losses[250], losses[300]), (losses[550], losses[600])):
         spread = before.max() - before.min()
@@ -263,7 +298,12 @@ def test_a_run_that_changes_the_backend_goes_on(tmp_path: Path, capsys: pytest.C
 
 @pytest.mark.parametrize(("name", "reason"), [("", "Is a directory"), ("no/result.json", "there is no folder")])
 def test_a_result_that_cannot_be_written_is_refused_before_an_episode(
-    counting: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, name: str, reason: str
+    counting: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    name: str,
+    reason: str,
 ) -> None:
-    monkeypatch.setattr(train.commands.eval, "play", pytest.fail)
+    monkeypatch.setattr(dreamer_spec.commands.eval, "play", pytest.fail)
     assert reason in refusal(capsys, counting, *COUNT, "1", "--json", str(tmp_path / name))

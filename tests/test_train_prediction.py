@@ -1,4 +1,5 @@
-"""Open-loop predictions: what the learners predict, what is recorded of an evaluation, and the pictures and numbers that come of it."""
+"""Open-loop predictions: what the learners predict, what is recorded of an evaluation, and the pictures and numbers
+that come of it."""
 
 import functools
 from pathlib import Path
@@ -11,20 +12,21 @@ from train_fakes import FakeLearner
 from train_runs import Make, run_quietly
 
 from conformance.problems import random_actions, random_observations, random_parameters, small_config, spaces
+from dreamer_spec.backend import Learner, learner_class
+from dreamer_spec.envs import Environments, make_env
+from dreamer_spec.evaluation import play
+from dreamer_spec.logger import Logger
+from dreamer_spec.pictures import draw_predictions, prune_pictures
+from dreamer_spec.prediction import CONTEXT, ROWS, STEPS, SequenceRecorder, predict, prediction_errors
 from reference_numpy.world_model import open_loop
 from spec import Discrete, Image, Spaces, Vector
-from train.backend import Learner, learner_class
-from train.envs import Environments, make_env
-from train.evaluation import play
-from train.logger import Logger
-from train.pictures import draw_predictions, prune_pictures
-from train.prediction import CONTEXT, ROWS, STEPS, SequenceRecorder, predict, prediction_errors
 
 ACTIONS = {"action": Discrete((2,))}
 Arrays = dict[str, np.ndarray]
 
 
-# --- The learners ----------------------------------------------------------------------------------------------------------------------
+# --- The learners
+# ------------------------------------------------------------------------------
 
 TASK = spaces("vector", "mixed")
 CONFIG = small_config("paper", "float32", latent_unimix=0.0)
@@ -36,7 +38,11 @@ def recorded() -> tuple[Arrays, np.ndarray, np.ndarray]:
     rng = np.random.default_rng(0)
     is_first = np.zeros((2, LENGTH), bool)
     is_first[:, 0] = is_first[1, 4] = True
-    return random_observations(rng, TASK, (2, LENGTH)), random_actions(rng, TASK, (2, LENGTH)).astype(np.float32), is_first
+    return (
+        random_observations(rng, TASK, (2, LENGTH)),
+        random_actions(rng, TASK, (2, LENGTH)).astype(np.float32),
+        is_first,
+    )
 
 
 @functools.cache
@@ -49,8 +55,12 @@ def with_parameters(backend: str, certain: bool) -> Learner:
     """The learner with random parameters; where it is certain, every latent is the same class, whatever is drawn."""
     params = random_parameters(np.random.default_rng(1), CONFIG, TASK, "float32")
     if certain:
-        params |= {f"rssm/{name}/out/bias": np.tile([0.0, 0, 1000, 0, 0], CONFIG.stoch) for name in ("posterior", "prior")}
-    state = learner(backend).state_dict() | {f"params/{name}": value.astype(np.float32) for name, value in params.items()}
+        params |= {
+            f"rssm/{name}/out/bias": np.tile([0.0, 0, 1000, 0, 0], CONFIG.stoch) for name in ("posterior", "prior")
+        }
+    state = learner(backend).state_dict() | {
+        f"params/{name}": value.astype(np.float32) for name, value in params.items()
+    }
     learner(backend).load_state_dict(state)
     return learner(backend)
 
@@ -61,7 +71,10 @@ def test_a_learner_predicts_what_the_reference_predicts(backend: str) -> None:
     before = with_parameters(backend, certain=True).state_dict()
     predicted = learner(backend).predict(observation, prev_action, is_first, SEEN, seed=3)
     params = {name.removeprefix("params/"): value for name, value in before.items() if name.startswith("params/")}
-    noise = {"posterior": np.full((2, SEEN, CONFIG.stoch), 0.5), "prior": np.full((2, LENGTH - SEEN, CONFIG.stoch), 0.5)}
+    noise = {
+        "posterior": np.full((2, SEEN, CONFIG.stoch), 0.5),
+        "prior": np.full((2, LENGTH - SEEN, CONFIG.stoch), 0.5),
+    }
     expected = open_loop(params, observation, prev_action, is_first, SEEN, noise, TASK, CONFIG)
     assert set(predicted) == {"mode", "position", "reward", "continue_"}
     for key, value in predicted.items():
@@ -88,11 +101,13 @@ def test_a_learner_refuses_a_context_that_leaves_nothing(backend: str, context: 
         learner(backend).predict(*recorded(), context, seed=0)
 
 
-# --- Recording and predicting ------------------------------------------------------------------------------------------------------------
+# --- Recording and predicting
+# ------------------------------------------------------------------------------
 
 
 def test_an_evaluation_is_recorded_from_its_start() -> None:
-    """Episodes of 5 records, one after the other: [episode, t] is what `Counting` shows, in memory that it uses again and again."""
+    """Episodes of 5 records, one after the other: [episode, t] is what `Counting` shows, in memory that it uses again
+    and again."""
     envs = Environments(functools.partial(make_env, "train_fakes:Counting"), ROWS + 2, False)
     recorder, calls = SequenceRecorder(), 0
 
@@ -132,18 +147,26 @@ def test_the_action_before_each_observation_is_given_and_the_length_never_change
     made = FakeLearner(task, CONFIG, seed=0)
     FakeLearner.diary, FakeLearner.seeds = [], []
     action = np.arange(1, steps + 1, dtype=np.float32).reshape(1, steps, 1)
-    sequences = {"x": 10 * action, "action": action, "is_first": np.arange(steps)[None] == 0, "reward": np.zeros((1, steps))}
+    sequences = {
+        "x": 10 * action,
+        "action": action,
+        "is_first": np.arange(steps)[None] == 0,
+        "reward": np.zeros((1, steps)),
+    }
     predicted = predict(made, task, sequences, seed=7)
     assert FakeLearner.seeds == [("predict", 7)]
     ((_, given),) = FakeLearner.diary
-    assert {name: value.shape[:2] for name, value in given.items()} == dict.fromkeys(("x", "prev_action", "is_first"), (1, STEPS))
+    assert {name: value.shape[:2] for name, value in given.items()} == dict.fromkeys(
+        ("x", "prev_action", "is_first"), (1, STEPS)
+    )
     np.testing.assert_array_equal(given["prev_action"][0, :steps, 0], np.arange(steps))
     np.testing.assert_array_equal(given["x"][0, :steps, 0], 10 * np.arange(1, steps + 1))
     np.testing.assert_array_equal(given["is_first"][0, :steps], sequences["is_first"][0])
     np.testing.assert_array_equal(predicted["reward"], np.arange(steps)[None])
 
 
-# --- Numbers -----------------------------------------------------------------------------------------------------------------------------
+# --- Numbers
+# ------------------------------------------------------------------------------
 
 
 def sequences_of(task: Spaces, steps: int, rows: int = 2) -> tuple[Arrays, Arrays]:
@@ -158,7 +181,9 @@ def sequences_of(task: Spaces, steps: int, rows: int = 2) -> tuple[Arrays, Array
         truth[key] = np.zeros(shape, {Image: np.uint8, Vector: np.float32, Discrete: np.int32}[type(space)])
         predicted[key] = np.zeros(shape, np.float32)
         if isinstance(space, Discrete):
-            predicted[key] = np.tile(np.concatenate([np.eye(classes)[0] for classes in space.classes]).astype(np.float32), (rows, steps, 1))
+            predicted[key] = np.tile(
+                np.concatenate([np.eye(classes)[0] for classes in space.classes]).astype(np.float32), (rows, steps, 1)
+            )
     truth["is_first"][:, 0] = True
     return truth, predicted
 
@@ -198,10 +223,14 @@ def test_the_next_episode_is_not_counted() -> None:
     errors = prediction_errors(task, truth, predicted, 2)
     assert errors["prediction/x_error"] == pytest.approx(1 / 4)  # one of the steps 2 of row 0, and 2 to 4 of row 1
     truth["is_first"][:, 2] = True
-    assert set(prediction_errors(task, truth, predicted, 2)) == {"prediction/x_context_error", "prediction/reward_context_error"}
+    assert set(prediction_errors(task, truth, predicted, 2)) == {
+        "prediction/x_context_error",
+        "prediction/reward_context_error",
+    }
 
 
-# --- Pictures ----------------------------------------------------------------------------------------------------------------------------
+# --- Pictures
+# ------------------------------------------------------------------------------
 
 
 def frames_of(path: Path) -> np.ndarray:
@@ -217,8 +246,12 @@ def frames_of(path: Path) -> np.ndarray:
 BLUE, ORANGE, GRAY = (0x25, 0x63, 0xEB), (0xEA, 0x58, 0x0C), (0x6B, 0x72, 0x80)
 
 
-@pytest.mark.parametrize(("channels", "pixel", "shown"), [(1, [200], 200), (3, [250, 120, 10], None), (4, [250, 120, 10, 77], None)])
-def test_an_animation_shows_truth_prediction_and_error(tmp_path: Path, channels: int, pixel: list[int], shown: int | None) -> None:
+@pytest.mark.parametrize(
+    ("channels", "pixel", "shown"), [(1, [200], 200), (3, [250, 120, 10], None), (4, [250, 120, 10, 77], None)]
+)
+def test_an_animation_shows_truth_prediction_and_error(
+    tmp_path: Path, channels: int, pixel: list[int], shown: int | None
+) -> None:
     """64 pixels of image, 3 of border, 6 of white: row by row below the words, one column for each sequence."""
     task = Spaces({"camera": Image(64, 64, channels)}, ACTIONS)
     truth, predicted = sequences_of(task, 8)
@@ -232,7 +265,9 @@ def test_an_animation_shows_truth_prediction_and_error(tmp_path: Path, channels:
         "camera-strip": "000000006000-camera-strip.png",
         "signals": "000000006000-signals.png",
     }
-    assert sorted(path.name for path in (tmp_path / "predictions").iterdir()) == sorted(path.name for path in paths.values())
+    assert sorted(path.name for path in (tmp_path / "predictions").iterdir()) == sorted(
+        path.name for path in paths.values()
+    )
     frames = frames_of(paths["camera"])
     assert frames.shape[0] == 8
     left, top, tile = 52, 24, 64 + 6 + 6
@@ -257,7 +292,8 @@ def coloured(path: Path, colour: tuple[int, int, int]) -> int:
 
 
 def test_a_strip_has_borders_in_the_colours_of_what_they_are(tmp_path: Path) -> None:
-    """The sequences whose episode goes on for longest are shown: rows 0 and 2 here, and the new episode of row 1 is not."""
+    """The sequences whose episode goes on for longest are shown: rows 0 and 2 here, and the new episode of row 1 is
+    not."""
     task = Spaces({"a": Image(16, 24, 3), "b": Image(16, 24, 1)}, ACTIONS)
     truth, predicted = sequences_of(task, STEPS, rows=3)
     truth["is_first"][1, 20] = True
@@ -267,7 +303,10 @@ def test_a_strip_has_borders_in_the_colours_of_what_they_are(tmp_path: Path) -> 
         blue, orange = coloured(paths[name], BLUE), coloured(paths[name], ORANGE)
         assert 0.3 < blue / orange < 0.45  # 3 frames seen, 8 predicted
         assert coloured(paths[name], GRAY) < blue / 10
-    short = {name: {key: value[1:2, :30] for key, value in arrays.items()} for name, arrays in (("truth", truth), ("model", predicted))}
+    short = {
+        name: {key: value[1:2, :30] for key, value in arrays.items()}
+        for name, arrays in (("truth", truth), ("model", predicted))
+    }
     paths = draw_predictions(tmp_path, 2, task, short["truth"], short["model"])
     assert coloured(paths["a-strip"], GRAY) > coloured(paths["a-strip"], BLUE) / 3
 
@@ -328,11 +367,19 @@ def test_the_pictures_of_the_newest_evaluations_stay(tmp_path: Path) -> None:
         (tmp_path / f"{step:012d}-camera.gif").touch()
     (tmp_path / "notes-of-mine.png").touch()
     prune_pictures(tmp_path, 1200)
-    assert sorted(path.name for path in tmp_path.glob("*.gif")) == [f"{step:012d}-camera.gif" for step in range(300, 1300, 100)]
-    assert sorted(path.name for path in tmp_path.glob("*.png"))[::10] == ["000000000300-signals.png", "notes-of-mine.png"]
+    assert sorted(path.name for path in tmp_path.glob("*.gif")) == [
+        f"{step:012d}-camera.gif" for step in range(300, 1300, 100)
+    ]
+    assert sorted(path.name for path in tmp_path.glob("*.png"))[::10] == [
+        "000000000300-signals.png",
+        "notes-of-mine.png",
+    ]
 
 
 def test_a_run_keeps_the_pictures_of_its_newest_evaluations(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("train.pictures.KEPT", 2)
+    monkeypatch.setattr("dreamer_spec.pictures.KEPT", 2)
     logdir = run_quietly(make(task="gym:CartPole-v1", steps=70, eval_every=20, eval_episodes=1)).options.logdir
-    assert sorted(path.name for path in (logdir / "predictions").iterdir()) == ["000000000040-signals.png", "000000000060-signals.png"]
+    assert sorted(path.name for path in (logdir / "predictions").iterdir()) == [
+        "000000000040-signals.png",
+        "000000000060-signals.png",
+    ]

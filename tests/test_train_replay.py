@@ -8,15 +8,17 @@ import numpy as np
 import pytest
 from replay_machine import assert_same, latents, record
 
+from dreamer_spec.replay import Replay, erase
+from dreamer_spec.replay.chunks import Shape
+from dreamer_spec.replay.layout import Layout, from_bfloat16, layout_of, to_bfloat16
 from spec import load_config, sizes
-from train.replay import Replay, erase
-from train.replay.chunks import Shape
-from train.replay.layout import Layout, from_bfloat16, layout_of, to_bfloat16
 
 LENGTH = 3
 
 
-def filled(directory: Path | None = None, records: int = 30, workers: int = 1, capacity: int = 1000, **settings) -> Replay:
+def filled(
+    directory: Path | None = None, records: int = 30, workers: int = 1, capacity: int = 1000, **settings
+) -> Replay:
     replay, rng = Replay(capacity, LENGTH, directory, **settings), np.random.default_rng(0)
     for n in range(records):
         for worker in range(workers):
@@ -31,7 +33,9 @@ def test_bfloat16_is_the_nearest_one() -> None:
     np.testing.assert_array_equal(from_bfloat16(to_bfloat16(exact)), exact)
     step = np.float32(2.0**-7)
     ties = np.array([1 + step / 2, 1 + 3 * step / 2, 1 + step / 2 + 2.0**-20, 1 + step / 2 - 2.0**-20], np.float32)
-    np.testing.assert_array_equal(from_bfloat16(to_bfloat16(ties)), np.array([1, 1 + 2 * step, 1 + step, 1], np.float32))
+    np.testing.assert_array_equal(
+        from_bfloat16(to_bfloat16(ties)), np.array([1, 1 + 2 * step, 1 + step, 1], np.float32)
+    )
     bits = np.array([0x7FC00000, 0xFFC00000, 0x7F800001, 0x7FFFFFFF, 0xFFFFFFFF, 0x3F800000], np.uint32)
     np.testing.assert_array_equal(np.isnan(from_bfloat16(to_bfloat16(bits.view(np.float32)))), [True] * 5 + [False])
 
@@ -162,7 +166,13 @@ def test_erasing_deletes_only_the_buffer(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "settings",
-    [{"deter_dtype": "float16"}, {"classes": 0}, {"chunk_records": 10}, {"chunk_records": 0, "block_records": 1}, {"block_records": 0}],
+    [
+        {"deter_dtype": "float16"},
+        {"classes": 0},
+        {"chunk_records": 10},
+        {"chunk_records": 0, "block_records": 1},
+        {"block_records": 0},
+    ],
 )
 def test_bad_settings_are_refused(settings: dict) -> None:
     with pytest.raises(ValueError, match=next(iter(settings))):
@@ -211,9 +221,13 @@ def test_bytes_of_a_step_are_those_of_the_chapter() -> None:
     chapter = (Path(__file__).parent.parent / "spec" / "11-replay.md").read_text(encoding="utf-8")
     for size in sizes():
         config = load_config("paper", size)
-        bare = {key: value for key, value in record(np.random.default_rng(0), 0).items() if key not in ("deter", "stoch")}
+        bare = {
+            key: value for key, value in record(np.random.default_rng(0), 0).items() if key not in ("deter", "stoch")
+        }
         step = {**bare, "deter": np.zeros(config.deter, np.float32), "stoch": np.zeros(config.stoch, np.int32)}
-        half, full = (layout_of(step, dtype, config.classes).latents_dtype.itemsize for dtype in ("bfloat16", "float32"))
+        half, full = (
+            layout_of(step, dtype, config.classes).latents_dtype.itemsize for dtype in ("bfloat16", "float32")
+        )
         one_hot = 4 * config.deter + 4 * config.stoch * config.classes
         row = f"| {size} | {config.deter:,} | {config.stoch} × {config.classes} | {half:,} | {full:,} | {one_hot:,} |"
         assert row in chapter

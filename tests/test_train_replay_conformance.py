@@ -7,7 +7,7 @@ import pytest
 from conformance.adapters.numpy_adapter import NumpyAdapter
 from conformance.check import Check
 from conformance.execute import run_check, selected_checks
-from train.replay import Replay
+from dreamer_spec.replay import Replay
 
 CHECKS = [check for check in selected_checks("float64") if "Replay" in check.uses]
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from replay_machine import latents, record
 
-from train.errors import UserError
-from train.replay import Replay
+from dreamer_spec.errors import UserError
+from dreamer_spec.replay import Replay
 
 CAPACITY, LENGTH = 60, 3
 MEMORY = Path("/dev/shm") if Path("/dev/shm").is_dir() else None

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from replay_machine import latents, record
 
-from train.errors import UserError
-from train.replay import Replay, chunks
+from dreamer_spec.errors import UserError
+from dreamer_spec.replay import Replay, chunks
 
 CAPACITY, LENGTH, WORKERS, RECORDS = 1000, 3, 2, 41
 SIZES = {"chunk_records": 8, "block_records": 4}
@@ -98,7 +98,9 @@ def test_a_damaged_chunk_is_named_and_left_out(tmp_path: Path, damage: str, whic
         own = stream if number > 1 else number
         for i in range(count):
             for key in ("x", "image", "deter", "stoch"):
-                np.testing.assert_array_equal(after[f"records/{key}"][row + i], before[f"records/{key}"][rows[own, first + i]])
+                np.testing.assert_array_equal(
+                    after[f"records/{key}"][row + i], before[f"records/{key}"][rows[own, first + i]]
+                )
     # The run goes on, also right behind the hole.
     rng = np.random.default_rng(1)
     for n in range(30):
@@ -155,7 +157,10 @@ def test_files_of_states_that_are_not_kept_go(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     for n in range(200):
         replay.add(record(rng, n), 0)
-        replay.write_back(replay.sample(rng.random(2))["ids"] if len(replay) else np.zeros((0, 2)), latents(rng, (2 * (n > 2), LENGTH)))
+        replay.write_back(
+            replay.sample(rng.random(2))["ids"] if len(replay) else np.zeros((0, 2)),
+            latents(rng, (2 * (n > 2), LENGTH)),
+        )
         if n % 10 == 0:
             replay.save(str(n))
             replay.keep([str(n - 10), str(n)])
@@ -208,7 +213,9 @@ def test_a_damaged_journal_costs_only_what_it_covers(tmp_path: Path) -> None:
 
 @pytest.mark.covers("REP-32")
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])
-def test_a_full_disk_is_named_and_the_last_state_intact(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+def test_a_full_disk_is_named_and_the_last_state_intact(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
     replay, rng = filled(tmp_path), np.random.default_rng(3)
     description, expected = replay.save("a"), replay.state_dict()
 

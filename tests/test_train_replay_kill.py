@@ -13,14 +13,15 @@ import numpy as np
 import pytest
 from replay_machine import latents, record
 
-from train.replay import Replay
+from dreamer_spec.replay import Replay
 
 CAPACITY, LENGTH, WORKERS = 200, 5, 3
 SIZES = {"chunk_records": 16, "block_records": 8}
 
 
 def steps(replay: Replay, directory: Path, start: int, stop: int) -> None:
-    """Records, train steps and saves number start .. stop - 1: what step n does follows from n and from what the buffer holds."""
+    """Records, train steps and saves number start .. stop - 1: what step n does follows from n and from what the buffer
+    holds."""
     for n in range(start, stop):
         rng = np.random.default_rng(n)
         for worker in range(WORKERS):
@@ -44,7 +45,9 @@ def save(replay: Replay, directory: Path, n: int) -> None:
 
 def resumed(directory: Path) -> tuple[Replay, int]:
     newest = max(directory.glob("*.json"))
-    replay = Replay.restore(directory / "replay", json.loads(newest.read_text()), CAPACITY, LENGTH, continue_streams=True)
+    replay = Replay.restore(
+        directory / "replay", json.loads(newest.read_text()), CAPACITY, LENGTH, continue_streams=True
+    )
     for other in directory.glob("*.json"):
         assert other <= newest
     return replay, int(newest.stem) + 1

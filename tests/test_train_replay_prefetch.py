@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from replay_machine import assert_same, latents, record
 
-from train.replay import Prefetcher, Replay
+from dreamer_spec.replay import Prefetcher, Replay
 
 LENGTH, WORKERS, ROWS = 3, 2, 3
 
@@ -136,7 +136,9 @@ def test_a_restored_run_takes_the_same_batches(tmp_path: Path) -> None:
     description, drawn = first.save("a")
     history(first, 21, 30)
     first.close()
-    second = Prefetcher(Replay.restore(tmp_path, description, 20, LENGTH, continue_streams=True), uniform, step=len(taken))
+    second = Prefetcher(
+        Replay.restore(tmp_path, description, 20, LENGTH, continue_streams=True), uniform, step=len(taken)
+    )
     second.load_drawn(drawn)
     taken += history(second, 21, 40)
     second.close()

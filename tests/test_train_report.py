@@ -14,14 +14,14 @@ import pytest
 from html_document import Document
 from PIL import Image
 
-from train import checkpoint
-from train.cli import main
-from train.errors import UserError
-from train.report import svg
-from train.report.page import render
-from train.report.results import headline, state
-from train.report.runs import Curve, RunLog, find_logdirs, group_runs, newest_pictures, read_run
-from train.report.series import means, over_runs, over_values, stacked, thinned
+from dreamer_spec import checkpoint
+from dreamer_spec.cli import main
+from dreamer_spec.errors import UserError
+from dreamer_spec.report import svg
+from dreamer_spec.report.page import render
+from dreamer_spec.report.results import headline, state
+from dreamer_spec.report.runs import Curve, RunLog, find_logdirs, group_runs, newest_pictures, read_run
+from dreamer_spec.report.series import means, over_runs, over_values, stacked, thinned
 
 NOW = 2_000_000_000.0
 NAN = float("nan")
@@ -36,7 +36,13 @@ def make_run(path: Path, lines: list[dict[str, Any]], **about: Any) -> Path:
     path.mkdir(parents=True)
     (path / "metrics.jsonl").write_text("".join(json.dumps({"seconds": 1.0, **line}) + "\n" for line in lines))
     if about:
-        base = {"format": 1, "task": "gym:X", "backend": "jax", "options": {"seed": 0, "steps": 100}, "hyperparameters": {"units": 8}}
+        base = {
+            "format": 1,
+            "task": "gym:X",
+            "backend": "jax",
+            "options": {"seed": 0, "steps": 100},
+            "hyperparameters": {"units": 8},
+        }
         (path / "run.json").write_text(json.dumps({**base, **about}))
     return path
 
@@ -91,7 +97,9 @@ def test_a_long_curve_is_thinned_to_its_ends() -> None:
 
 
 def test_shares_add_up_to_one() -> None:
-    steps, shares = stacked({"a": [curve([0, 10], [0.5, 0.2])], "b": [curve([0, 10], [0.5, 0.6])], "c": [curve([0], [NAN])]}, 10, 10)
+    steps, shares = stacked(
+        {"a": [curve([0, 10], [0.5, 0.2])], "b": [curve([0, 10], [0.5, 0.6])], "c": [curve([0], [NAN])]}, 10, 10
+    )
     assert steps.tolist() == [0, 10]
     assert shares["a"].tolist() == pytest.approx([0.5, 0.25])
     assert np.sum(list(shares.values()), axis=0).tolist() == pytest.approx([1, 1])
@@ -104,7 +112,13 @@ def test_ticks_are_round_numbers() -> None:
     assert svg.linear_ticks(0, 8000, 5) == [0, 2000, 4000, 6000, 8000]
     assert svg.linear_ticks(-0.11, 0.31, 4) == pytest.approx([-0.1, 0, 0.1, 0.2, 0.3])
     assert svg.log_ticks(2, 2000, 3) == [10, 100, 1000]
-    assert [svg.tick_format([], True)(value) for value in (1e-3, 0.1, 10, 1e4, 1e6)] == ["0.001", "0.1", "10", "10,000", "1e+06"]
+    assert [svg.tick_format([], True)(value) for value in (1e-3, 0.1, 10, 1e4, 1e6)] == [
+        "0.001",
+        "0.1",
+        "10",
+        "10,000",
+        "1e+06",
+    ]
 
 
 @pytest.mark.parametrize(
@@ -177,8 +191,16 @@ def test_runs_that_differ_in_the_seed_are_one_group(tmp_path: Path) -> None:
     runs = [
         read_run(make_run(tmp_path / "a", [{"step": 1}], options={"seed": 0, "steps": 100, "action_repeat": 1})),
         read_run(make_run(tmp_path / "b", [{"step": 1}], options={"seed": 1, "steps": 200, "action_repeat": 1})),
-        read_run(make_run(tmp_path / "c", [{"step": 1}], options={"seed": 0, "steps": 100, "action_repeat": 1}, backend="torch")),
-        read_run(make_run(tmp_path / "d", [{"step": 1}], hyperparameters={"units": 16}, changed_hyperparameters={"units": 16})),
+        read_run(
+            make_run(
+                tmp_path / "c", [{"step": 1}], options={"seed": 0, "steps": 100, "action_repeat": 1}, backend="torch"
+            )
+        ),
+        read_run(
+            make_run(
+                tmp_path / "d", [{"step": 1}], hyperparameters={"units": 16}, changed_hyperparameters={"units": 16}
+            )
+        ),
         read_run(make_run(tmp_path / "e", [{"step": 1}], task="gym:Y")),
         read_run(make_run(tmp_path / "f", [{"step": 1}])),
         read_run(make_run(tmp_path / "g", [{"step": 1}])),
@@ -201,7 +223,9 @@ def test_an_older_run_is_known_from_its_checkpoint(tmp_path: Path) -> None:
     for step, seed in (("000000000005", 7), ("000000000009", 8)):
         (path / "checkpoints" / step).mkdir(parents=True)
         identity = {"task": "gym:Old", "seed": seed, "action_repeat": 2, "image_size": 64, "units": 16}
-        (path / "checkpoints" / step / "run.json").write_text(json.dumps({"identity": identity, "backend": "torch", "spaces": {}}))
+        (path / "checkpoints" / step / "run.json").write_text(
+            json.dumps({"identity": identity, "backend": "torch", "spaces": {}})
+        )
     (path / "checkpoints" / "000000000012.tmp").mkdir()
     run = read_run(path)
     assert (run.task, run.backend, run.seed, run.hyperparameters) == ("gym:Old", "torch", 8, {"units": 16})
@@ -247,7 +271,13 @@ def test_damaged_lines_are_counted(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "content", ["{", "[]", "[" * 100_000, '{"format": 1, "task": 3, "options": [], "starts": {"a": 1}, "machine": "x", "preflight": true}']
+    "content",
+    [
+        "{",
+        "[]",
+        "[" * 100_000,
+        '{"format": 1, "task": 3, "options": [], "starts": {"a": 1}, "machine": "x", "preflight": true}',
+    ],
 )
 def test_a_damaged_run_json_gives_a_page(tmp_path: Path, content: str) -> None:
     path = make_run(tmp_path / "a", [{"step": 2, "episode/return": 1.5}])
@@ -256,7 +286,14 @@ def test_a_damaged_run_json_gives_a_page(tmp_path: Path, content: str) -> None:
 
 
 def test_the_newest_pictures_of_each_key(tmp_path: Path) -> None:
-    names = ["000000000010-a.png", "000000000020-a.png", "000000000020-a.gif", "000000000010-b-c.png", "x-a.png", "000000000030-a.txt"]
+    names = [
+        "000000000010-a.png",
+        "000000000020-a.png",
+        "000000000020-a.gif",
+        "000000000010-b-c.png",
+        "x-a.png",
+        "000000000030-a.txt",
+    ]
     for name in names:
         (tmp_path / name).touch()
     found = [path.name for path in newest_pictures(tmp_path)]
@@ -268,7 +305,10 @@ def test_the_newest_pictures_of_each_key(tmp_path: Path) -> None:
 
 def test_headlines(tmp_path: Path) -> None:
     def groups(*lines: list[dict[str, Any]]) -> Any:
-        paths = [make_run(tmp_path / f"{len(list(tmp_path.iterdir()))}", one, options={"seed": seed}) for seed, one in enumerate(lines)]
+        paths = [
+            make_run(tmp_path / f"{len(list(tmp_path.iterdir()))}", one, options={"seed": seed})
+            for seed, one in enumerate(lines)
+        ]
         [group] = group_runs([read_run(path) for path in paths])["gym:X"]
         return headline(group)
 
@@ -298,10 +338,23 @@ def full_run(path: Path, seed: int) -> Path:
     lines: list[dict[str, Any]] = [{"step": 0, "random/return": 5.0}]
     for step in range(10, 101, 10):
         lines.append(
-            {"step": step, "episode/return": step + seed, "episode/length": 10, "train/loss/total": float(rng.normal()), "own": NAN}
+            {
+                "step": step,
+                "episode/return": step + seed,
+                "episode/length": 10,
+                "train/loss/total": float(rng.normal()),
+                "own": NAN,
+            }
         )
         lines.append({"step": step, "time/train": 0.75, "time/other": 0.25, "evaluation/return": 2.0 * step})
-    start = {"time": "2026-01-01T00:00:00+00:00", "step": 0, "backend": "jax", "device": "cpu", "commit": "abc", "versions": {"jax": "1"}}
+    start = {
+        "time": "2026-01-01T00:00:00+00:00",
+        "step": 0,
+        "backend": "jax",
+        "device": "cpu",
+        "commit": "abc",
+        "versions": {"jax": "1"},
+    }
     about = {
         "options": {"seed": seed, "steps": 100},
         "command": "train --backend jax --task gym:X",
@@ -325,7 +378,16 @@ def full_run(path: Path, seed: int) -> Path:
 def test_the_page_holds_what_the_runs_are(tmp_path: Path) -> None:
     paths = [full_run(tmp_path / "first", 0), full_run(tmp_path / "second", 1)]
     document = Document(page(*paths))
-    for text in ("gym:X", "2 seeds", "200 ± 0", "train --backend jax --task gym:X", "networks agree", "1.5e-07", "A Processor", "jax 2"):
+    for text in (
+        "gym:X",
+        "2 seeds",
+        "200 ± 0",
+        "train --backend jax --task gym:X",
+        "networks agree",
+        "1.5e-07",
+        "A Processor",
+        "jax 2",
+    ):
         assert text in document.text, text
     assert "encoderNET-2, NET-12passed6.25%" in document.text
     assert "not finite at step 10" in document.text
@@ -334,7 +396,9 @@ def test_the_page_holds_what_the_runs_are(tmp_path: Path) -> None:
     assert "what it means" in document.text
     assert document.count("svg") == 6, "training, evaluations, length, loss, time, own"
     image = base64.b64encode((paths[0] / "predictions" / "000000000100-image.png").read_bytes()).decode()
-    assert [attributes["src"] for tag, attributes in document.elements if tag == "img"] == [f"data:image/png;base64,{image}"] * 2
+    assert [attributes["src"] for tag, attributes in document.elements if tag == "img"] == [
+        f"data:image/png;base64,{image}"
+    ] * 2
 
 
 def test_the_page_needs_nothing_else_and_forbids_it(tmp_path: Path) -> None:
@@ -361,7 +425,17 @@ def test_what_a_run_says_does_not_become_markup(tmp_path: Path) -> None:
             return [everywhere(entry) for entry in value]
         return evil if isinstance(value, str) else value
 
-    KNOWN = {*RunLog.__dataclass_fields__, "format", "observations", "actions", "kind", "versions", "summary", "passed", "time"}
+    KNOWN = {
+        *RunLog.__dataclass_fields__,
+        "format",
+        "observations",
+        "actions",
+        "kind",
+        "versions",
+        "summary",
+        "passed",
+        "time",
+    }
     plain = full_run(tmp_path / "plain", 0)
     path = full_run(tmp_path / "evil<b>", 0)
     about = everywhere(json.loads((path / "run.json").read_text()))
@@ -379,12 +453,18 @@ def test_what_a_run_says_does_not_become_markup(tmp_path: Path) -> None:
 
 
 def test_a_long_run_gives_a_small_page(tmp_path: Path) -> None:
-    lines = [{"step": step, "episode/return": step % 97, **{f"train/m{index}": step % 89 for index in range(10)}} for step in range(20_000)]
+    lines = [
+        {"step": step, "episode/return": step % 97, **{f"train/m{index}": step % 89 for index in range(10)}}
+        for step in range(20_000)
+    ]
     assert len(page(make_run(tmp_path / "a", lines))) < 150_000
 
 
 def test_runs_of_several_tasks_each_have_their_curves(tmp_path: Path) -> None:
-    first, second = full_run(tmp_path / "a", 0), make_run(tmp_path / "b", [{"step": 1, "episode/return": 1.0}], task="dmc:y")
+    first, second = (
+        full_run(tmp_path / "a", 0),
+        make_run(tmp_path / "b", [{"step": 1, "episode/return": 1.0}], task="dmc:y"),
+    )
     text = Document(page(first, second, make_run(tmp_path / "c", []))).text
     assert "Returns: gym:X" in text
     assert "Returns: dmc:y" in text
@@ -419,7 +499,9 @@ def test_what_is_no_file_is_noted_and_not_waited_for(tmp_path: Path) -> None:
 
 
 def test_not_every_one_of_very_many_metrics_is_drawn(tmp_path: Path) -> None:
-    many = {f"m{index}": 1.0 for index in range(90_000)} | {f"train/loss/reconstruction/k{index}": 1.0 for index in range(1000)}
+    many = {f"m{index}": 1.0 for index in range(90_000)} | {
+        f"train/loss/reconstruction/k{index}": 1.0 for index in range(1000)
+    }
     content = page(make_run(tmp_path / "a", [{"step": 1, **many}, {"step": 2, **many}]))
     text = Document(content).text
     assert "89,800 more metrics of this section are not drawn." in text
@@ -457,7 +539,9 @@ def test_the_command_writes_the_page(tmp_path: Path, capsys: pytest.CaptureFixtu
         (["report", "{}/missing", "--out", ""], "cannot write .: Is a directory"),
     ],
 )
-def test_mistakes_have_one_clear_line(tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str) -> None:
+def test_mistakes_have_one_clear_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
     if "--out" in arguments:
         make_run(tmp_path / "run", [])
     assert main([argument.format(tmp_path) for argument in arguments]) == 2

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import train_fakes
 
+from dreamer_spec.envs import Environments, History, Record, history, make_env, random_actions
 from reference_numpy.training_loop import derive_seed
-from train.envs import Environments, History, Record, history, make_env, random_actions
 
 COUNT = 2
 AFTER = 50  # records that are compared
@@ -56,7 +56,9 @@ TASKS = [
 
 @pytest.mark.parametrize(("task", "processes", "options"), TASKS)
 @pytest.mark.covers("LOOP-33", "LOOP-34")
-def test_what_follows_a_restore_is_what_would_have_followed(make: Make, task: str, processes: bool, options: dict[str, int]) -> None:
+def test_what_follows_a_restore_is_what_would_have_followed(
+    make: Make, task: str, processes: bool, options: dict[str, int]
+) -> None:
     """At the first record of all, in the middle, at an end, and at the reset after it."""
     if task.startswith("dmc:"):
         pytest.importorskip("dm_control")
@@ -79,7 +81,9 @@ def test_what_follows_a_restore_is_what_would_have_followed(make: Make, task: st
         assert equal(record, records[moment]), moment
         for action, expected in zip(actions[moment:][:AFTER], records[moment + 1 :][:AFTER], strict=True):
             assert equal(again.step(action), expected), moment
-        assert [entry.actions.tolist() for entry in again.histories()] == [entry.actions.tolist() for entry in histories[moment + AFTER]]
+        assert [entry.actions.tolist() for entry in again.histories()] == [
+            entry.actions.tolist() for entry in histories[moment + AFTER]
+        ]
 
 
 def test_a_history_is_that_of_the_records_that_were_given(make: Make) -> None:
@@ -87,12 +91,16 @@ def test_a_history_is_that_of_the_records_that_were_given(make: Make) -> None:
     envs.reset([8, 9])
     envs.step(np.full((2, 2), 0.5, np.float32))
     envs.start(np.ones((2, 2), np.float32))
-    assert [entry.actions.tolist() for entry in envs.histories()] == [[[0.5, 0.5]], [[0.5, 0.5]]], "the last action has no record yet"
+    assert [entry.actions.tolist() for entry in envs.histories()] == [[[0.5, 0.5]], [[0.5, 0.5]]], (
+        "the last action has no record yet"
+    )
     for _ in range(4):
         envs.finish()
         envs.start(np.zeros((2, 2), np.float32))
     assert [entry.to_json() for entry in envs.histories()] == [{"seed": 8, "episode": 1}, {"seed": 9, "episode": 1}]
-    assert [entry.actions.shape for entry in envs.histories()] == [(0, 2), (0, 2)], "what led to a reset is no action of the episode"
+    assert [entry.actions.shape for entry in envs.histories()] == [(0, 2), (0, 2)], (
+        "what led to a reset is no action of the episode"
+    )
 
 
 @pytest.mark.covers("LOOP-26", "LOOP-32", "LOOP-34")
@@ -133,7 +141,12 @@ def test_what_cannot_be_replayed_is_not_restored(make: Make, processes: bool) ->
     fresh = envs.reset([8, 9])
     fitting = envs.histories()
     action = np.float32([[0, 0.25]])  # It raises.
-    for histories in ([fitting[0]], [fitting[0], None], [fitting[0], History(9, 0, action)], [fitting[0], History(9, 0, action[:, :1])]):
+    for histories in (
+        [fitting[0]],
+        [fitting[0], None],
+        [fitting[0], History(9, 0, action)],
+        [fitting[0], History(9, 0, action[:, :1])],
+    ):
         assert envs.restore(histories) is None
         record = envs.reset([8, 9])
         assert record["observation"][:, 1].tolist() == fresh["observation"][:, 1].tolist()

@@ -10,9 +10,9 @@ import train_fakes
 from train_fakes import FakeLearner
 from train_runs import Make, batches, logged, run_quietly, stored
 
-from train import loop, setup
-from train.envs import Environments, make_env
-from train.errors import UserError
+from dreamer_spec import loop, setup
+from dreamer_spec.envs import Environments, make_env
+from dreamer_spec.errors import UserError
 
 RATIO = 3.0
 
@@ -48,7 +48,9 @@ def closed() -> Any:
 
 @pytest.fixture
 def single(make: Make) -> Make:
-    return functools.partial(make, task="test_train_single:Watched", envs=1, image_size=16, replay_ratio=RATIO, steps=150)
+    return functools.partial(
+        make, task="test_train_single:Watched", envs=1, image_size=16, replay_ratio=RATIO, steps=150
+    )
 
 
 def events() -> str:
@@ -77,7 +79,9 @@ def test_train_steps_wait_for_the_end_of_the_episode_and_none_is_lost(single: Ma
     for episode in episodes[:-1]:
         played, _, rest = episode.partition("t")
         assert set(played) <= {"p", "s"}, "nothing is trained while the episode goes on"
-        assert rest.strip("t") in ("", "p"), "all of it at the end, before the last record is stored and before the reset"
+        assert rest.strip("t") in ("", "p"), (
+            "all of it at the end, before the last record is stored and before the reset"
+        )
     assert sum("t" in episode for episode in episodes) > 2
 
 
@@ -132,9 +136,18 @@ EVALUATED = {"eval_every": 40, "eval_episodes": 2, "random_episodes": 2}
 
 @pytest.mark.covers("LOOP-18", "LOOP-66")
 @pytest.mark.parametrize("train_when", ["always", "between-episodes"])
-def test_training_is_the_same_as_with_an_environment_of_its_own_for_evaluation(make: Make, train_when: str, tmp_path: Any) -> None:
+def test_training_is_the_same_as_with_an_environment_of_its_own_for_evaluation(
+    make: Make, train_when: str, tmp_path: Any
+) -> None:
     single = functools.partial(
-        make, task="train_fakes:Maze", envs=1, image_size=16, replay_ratio=RATIO, steps=150, train_when=train_when, **EVALUATED
+        make,
+        task="train_fakes:Maze",
+        envs=1,
+        image_size=16,
+        replay_ratio=RATIO,
+        steps=150,
+        train_when=train_when,
+        **EVALUATED,
     )
     streams, trained, evaluations = {}, {}, {}
     for where in ("own", "shared"):
@@ -142,7 +155,10 @@ def test_training_is_the_same_as_with_an_environment_of_its_own_for_evaluation(m
         state = run_quietly(single(eval_env=where, logdir=tmp_path / where))
         streams[where], trained[where] = stored(state), batches()
         evaluations[where] = [line["step"] for line in logged(tmp_path / where) if "evaluation/return" in line]
-    for one, other in (*zip(streams["own"], streams["shared"], strict=True), *zip(trained["own"], trained["shared"], strict=True)):
+    for one, other in (
+        *zip(streams["own"], streams["shared"], strict=True),
+        *zip(trained["own"], trained["shared"], strict=True),
+    ):
         assert all(one[key].tobytes() == other[key].tobytes() for key in one)
     (stream,) = streams["shared"]
     ends = np.flatnonzero(stream["is_last"]) + 1
@@ -163,13 +179,19 @@ def test_there_is_never_a_second_instance_and_training_begins_its_episodes_itsel
 
 
 @pytest.mark.covers("LOOP-23", "LOOP-66")
-def test_a_run_goes_on_exactly_after_its_last_evaluation(make: Make, tmp_path: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    single = functools.partial(make, task="train_fakes:Maze", envs=1, image_size=16, replay_ratio=RATIO, eval_env="shared", **EVALUATED)
+def test_a_run_goes_on_exactly_after_its_last_evaluation(
+    make: Make, tmp_path: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    single = functools.partial(
+        make, task="train_fakes:Maze", envs=1, image_size=16, replay_ratio=RATIO, eval_env="shared", **EVALUATED
+    )
     (whole,) = stored(run_quietly(single(steps=150, logdir=tmp_path / "whole")))
     loop.run(single(steps=75, logdir=tmp_path / "parts"), FakeLearner)
     (parts,) = stored(run_quietly(single(steps=150, logdir=tmp_path / "parts")))
     assert "cannot be restored" not in capsys.readouterr().out
-    assert all(whole[key].tobytes() == parts[key].tobytes() for key in ("reward", "is_first", "is_last", "action", "view"))
+    assert all(
+        whole[key].tobytes() == parts[key].tobytes() for key in ("reward", "is_first", "is_last", "action", "view")
+    )
 
 
 def test_lent_environments_come_back_as_they_were() -> None:
@@ -191,7 +213,9 @@ def test_lent_environments_come_back_as_they_were() -> None:
     assert (kept.seed, kept.episode, kept.actions.tobytes()) == (was.seed, was.episode, was.actions.tobytes())
     for _ in range(40):
         record, same = envs.next_episodes() if record["is_last"][0] else envs.step(action), other.step(action)
-        assert {key: value.tobytes() for key, value in record.items()} == {key: value.tobytes() for key, value in same.items()}
+        assert {key: value.tobytes() for key, value in record.items()} == {
+            key: value.tobytes() for key, value in same.items()
+        }
 
 
 @pytest.mark.parametrize(("option", "value"), [("train_when", "between-episodes"), ("eval_env", "shared")])

@@ -1,4 +1,5 @@
-"""What is read into a task's spaces, what is said of it, and that training, evaluation and an exported policy act alike in every one."""
+"""What is read into a task's spaces, what is said of it, and that training, evaluation and an exported policy act alike
+in every one."""
 
 import json
 import re
@@ -14,10 +15,10 @@ import train_fakes
 from gymnasium import spaces as gym
 from train_runs import Make, run_quietly
 
+from dreamer_spec.envs import ContractEnv, make_env, translate
+from dreamer_spec.errors import UserError
 from reference_numpy.training_loop import environment_action
 from spec import Discrete, Image, Vector
-from train.envs import ContractEnv, make_env, translate
-from train.errors import UserError
 
 ROOT = Path(__file__).resolve().parent.parent
 TWO = gym.Discrete(2)
@@ -80,7 +81,9 @@ def test_what_a_box_becomes(low: float, high: float, shape: tuple[int, ...], dty
 def test_bounds_must_hold_everywhere() -> None:
     high = np.full((20, 20), 255, U1)
     high[3, 4] = 254
-    assert translate(gym.Box(np.zeros((20, 20), U1), high, dtype=U1), TWO).spaces.observations["observation"] == Vector(400)
+    assert translate(gym.Box(np.zeros((20, 20), U1), high, dtype=U1), TWO).spaces.observations["observation"] == Vector(
+        400
+    )
     low, high = np.array([[0, 5], [1, 0]]), np.array([[1, 9], [1, 3]])
     translation = translate(gym.Box(low, high, dtype=I8), TWO)
     assert translation.spaces.observations["observation"] == Discrete((2, 5, 1, 4))
@@ -93,7 +96,10 @@ def test_bounds_must_hold_everywhere() -> None:
 def test_axes_that_are_neither_rows_nor_columns_become_channels_in_order() -> None:
     rng = np.random.default_rng(0)
     first = rng.integers(0, 256, (3, 16, 20), U1)
-    assert (seen(gym.Box(0, 255, (3, 16, 20), U1), first, 16) == seen(gym.Box(0, 255, (16, 20, 3), U1), first.transpose(1, 2, 0), 16)).all()
+    assert (
+        seen(gym.Box(0, 255, (3, 16, 20), U1), first, 16)
+        == seen(gym.Box(0, 255, (16, 20, 3), U1), first.transpose(1, 2, 0), 16)
+    ).all()
     stack = rng.integers(0, 256, (2, 16, 16, 3), U1)
     joined = seen(gym.Box(0, 255, stack.shape, U1), stack, 16)
     assert (joined == np.concatenate(list(stack), axis=-1)).all()
@@ -112,7 +118,9 @@ def test_images_of_other_types_are_rounded_to_bytes() -> None:
         result = seen(space, value, 16)
         assert result.dtype == U1
         assert (result == bytes_).all(), space
-    halves = np.full((16, 16), 0.5, np.float64) + np.arange(256).reshape(16, 16)[:, ::-1] % 2  # 0.5 and 1.5, to the even one
+    halves = (
+        np.full((16, 16), 0.5, np.float64) + np.arange(256).reshape(16, 16)[:, ::-1] % 2
+    )  # 0.5 and 1.5, to the even one
     assert np.unique(seen(gym.Box(0, 255, (16, 16), np.float64), halves, 16)).tolist() == [0, 2]
 
 
@@ -169,7 +177,8 @@ def test_actions_agree_with_the_reference_in_every_kind_of_bounds() -> None:
     translation, rng = translate(TWO, gym.Box(low, high, dtype=np.float64)), np.random.default_rng(0)
     for flat in rng.normal(size=(200, 5)).astype(F4):
         np.testing.assert_array_equal(
-            translation.action(flat), environment_action(flat, translation.spaces, {"action": low}, {"action": high})["action"]
+            translation.action(flat),
+            environment_action(flat, translation.spaces, {"action": low}, {"action": high})["action"],
         )
 
 
@@ -194,13 +203,20 @@ def test_boxes_of_whole_numbers_are_choices() -> None:
 
 @pytest.mark.covers("LOOP-60")
 def test_tuples_and_dictionaries_keep_their_form() -> None:
-    observation = gym.Tuple([gym.Dict({"b": gym.Tuple([gym.Box(-1, 1, (2,)), TWO]), "a": gym.Discrete(3, start=5)}), TWO])
+    observation = gym.Tuple(
+        [gym.Dict({"b": gym.Tuple([gym.Box(-1, 1, (2,)), TWO]), "a": gym.Discrete(3, start=5)}), TWO]
+    )
     action = gym.Dict({"x": gym.Tuple([gym.Discrete(2), gym.Box(0, 1, ()), gym.Tuple([gym.Discrete(2, start=7)])])})
     translation = translate(observation, action)
     assert list(translation.spaces.observations) == ["0_a", "0_b_0", "0_b_1", "1"]
     assert list(translation.spaces.actions) == ["x_0", "x_1", "x_2_0"]
     arrays = translation.observation(({"a": 7, "b": [np.float32([0.5, -0.5]), 1]}, 0))
-    assert {key: value.tolist() for key, value in arrays.items()} == {"0_a": [2], "0_b_0": [0.5, -0.5], "0_b_1": [1], "1": [0]}
+    assert {key: value.tolist() for key, value in arrays.items()} == {
+        "0_a": [2],
+        "0_b_0": [0.5, -0.5],
+        "0_b_1": [1],
+        "1": [0],
+    }
     taken = translation.action(F4([0, 1, 0.5, 1, 0]))
     assert taken == {"x": (1, 0.75, (7,))}
     assert action.contains(taken)
@@ -216,7 +232,11 @@ def test_tuples_and_dictionaries_keep_their_form() -> None:
 
 
 SENSORS = gym.Dict(
-    {"arm": gym.Dict({"angle": gym.Box(-1, 1, (2,)), "name": gym.Text(5)}), "log": gym.Tuple([gym.Text(3), TWO]), "reward": TWO}
+    {
+        "arm": gym.Dict({"angle": gym.Box(-1, 1, (2,)), "name": gym.Text(5)}),
+        "log": gym.Tuple([gym.Text(3), TWO]),
+        "reward": TWO,
+    }
 )
 
 
@@ -266,16 +286,21 @@ LINES = [
     "observation depth: Box uint16 [64, 64] in [0, 65535] -> image 64 x 64, 1 channel",
     "WARNING: observation depth: its 16 bits are rounded to 8",
     "observation goal: Box float32 [64, 64, 3] in [-1, 1] -> 12,288 real numbers",
-    "WARNING: observation goal: 12,288 numbers without convolutions; an image is a Box of uint8 from 0 to 255, or of floats from 0 to 1, "
+    "WARNING: observation goal: 12,288 numbers without convolutions; an image is a Box of uint8 from 0 "
+    "to 255, or of floats from 0 to 1, "
     "whose two sides are at least 16 and whose other axes are shorter",
     "observation map: Box int8 [38, 38] in [0, 1] -> 1,444 real numbers",
     "observation room: Discrete int64 from -2 -> 1 choice of 5 classes",
     "observation speed: Box float64 [6] in [-2, 2], [-1, 1] -> 6 real numbers",
     "observation view: Box uint8 [7, 7, 3] in [0, 255] -> 147 real numbers",
-    "WARNING: observation view: too small for an image (sides of 16); if its numbers are codes, declare the highest of them as `high` of "
+    "WARNING: observation view: too small for an image (sides of 16); if its numbers are codes, declare "
+    "the highest of them as `high` of "
     "the Box",
     "observation window: Box uint8 [20, 20, 3] in [0, 255] -> image 64 x 64, 3 channels, resized from 20 x 20",
-    "WARNING: observation window: a small image; if its numbers are codes, declare the highest of them as `high` of the Box",
+    (
+        "WARNING: observation window: a small image; if its numbers are codes, declare the "
+        "highest of them as `high` of the Box"
+    ),
     "observation notes: left out",
     "action buttons: MultiDiscrete int64 [2] from 0 to 7 -> 2 choices of 2 to 3 classes",
     "action force: Box float64 [3] in [-1e+10, 1e+10], [0, inf], [-2, 2] -> 3 real numbers in [-1, 1], [0, 2], [-2, 2]",
@@ -372,7 +397,10 @@ def test_images_that_hold_codes_are_warned_of(
 ) -> None:
     monkeypatch.setattr(Codes, "most", most)
     run_quietly(make(task="test_train_spaces:Codes", steps=4, image_size=16, processes="no"))
-    line = f"WARNING: observation observation: the first images hold no number above {most} of 255; if its numbers are codes"
+    line = (
+        f"WARNING: observation observation: the first images hold no number above "
+        f"{most} of 255; if its numbers are codes"
+    )
     assert (line in capsys.readouterr().out) == warned
 
 

@@ -1,4 +1,5 @@
-"""What surrounds a run: signals, outputs that fail, trainers that are killed, limits of the system. With real processes."""
+"""What surrounds a run: signals, outputs that fail, trainers that are killed, limits of the system. With real
+processes."""
 
 import os
 import signal
@@ -102,7 +103,8 @@ def test_two_signals_within_one_call_of_a_library_are_two(tmp_path: Path) -> Non
 
 @pytest.mark.covers("LOOP-48")
 def test_a_terminal_that_is_closed_twice_is_closed_once(tmp_path: Path) -> None:
-    """Shells pass the signal on, and the system sends it again when they are gone: the checkpoint is saved all the same."""
+    """Shells pass the signal on, and the system sends it again when they are gone: the checkpoint is saved all the
+    same."""
     process = start("Evaluated", tmp_path / "run", *NO, "--eval-episodes", "1000")
     arrived(process, tmp_path / "run")
     process.send_signal(HUP)
@@ -122,15 +124,20 @@ def test_a_signal_in_the_last_evaluation_ends_with_a_word(tmp_path: Path, number
     out, error = process.communicate(timeout=60)
     assert (process.returncode, error) == (130, "")
     line = out.splitlines()[-1]
-    assert line.startswith(f"interrupted in the last evaluation, all training is saved in {logdir}/checkpoints/000000000060")
+    assert line.startswith(
+        f"interrupted in the last evaluation, all training is saved in {logdir}/checkpoints/000000000060"
+    )
     again = start("Counting", logdir, *NO)
     assert again.wait(60) == 2, "another task"
 
 
 @pytest.mark.parametrize("processes", [NO, YES])
 @pytest.mark.covers("LOOP-45", "LOOP-52")
-def test_what_an_environment_does_to_its_process_does_not_reach_the_run(tmp_path: Path, processes: tuple[str, ...]) -> None:
-    """Its working directory, its outputs, its threads: a relative log directory is found, and no word goes into a file of the run."""
+def test_what_an_environment_does_to_its_process_does_not_reach_the_run(
+    tmp_path: Path, processes: tuple[str, ...]
+) -> None:
+    """Its working directory, its outputs, its threads: a relative log directory is found, and no word goes into a file
+    of the run."""
     logdir = tmp_path / "run"
     process = start("Unruly", Path(os.path.relpath(logdir, ROOT)), *processes, ARRIVED=str(tmp_path / "arrived"))
     process.communicate(timeout=60)
@@ -144,7 +151,13 @@ def test_what_an_environment_does_to_its_process_does_not_reach_the_run(tmp_path
 
 def test_a_working_directory_that_is_removed_does_not_end_a_run(tmp_path: Path) -> None:
     (tmp_path / "home").mkdir()
-    process = start("Homeless", tmp_path / "run", *NO, shell=f'cd {tmp_path / "home"}; exec "$@"', PYTHONPATH=f"{ROOT}:{ROOT / 'tests'}")
+    process = start(
+        "Homeless",
+        tmp_path / "run",
+        *NO,
+        shell=f'cd {tmp_path / "home"}; exec "$@"',
+        PYTHONPATH=f"{ROOT}:{ROOT / 'tests'}",
+    )
     _, error = process.communicate(timeout=60)
     assert process.returncode == 0, error
     assert finished(tmp_path)
@@ -244,7 +257,10 @@ def test_a_path_that_is_too_long_for_a_socket_is_said(tmp_path: Path) -> None:
     process = start("Counting", tmp_path / "run", *YES, TMPDIR=str(long))
     _, error = process.communicate(timeout=60)
     assert process.returncode == 2
-    assert "its process cannot be started: OSError: AF_UNIX path too long; set TMPDIR to a folder with a shorter path" in error
+    assert (
+        "its process cannot be started: OSError: AF_UNIX path too long; set TMPDIR to a folder with a shorter path"
+        in error
+    )
     assert error.count("\n") == 1
 
 
@@ -253,7 +269,10 @@ def test_too_few_file_descriptors_are_said(tmp_path: Path) -> None:
     _, error = process.communicate(timeout=60)
     assert process.returncode == 2
     last = error.splitlines()[-1]
-    assert "its process cannot be started: OSError: [Errno 24] Too many open files; raise the limit of open files (ulimit -n)" in last
+    assert (
+        "its process cannot be started: OSError: [Errno 24] Too many open files; raise "
+        "the limit of open files (ulimit -n)"
+    ) in last
 
 
 # The kit
@@ -316,7 +335,9 @@ def test_the_kit_reports_texts_that_cannot_be_written(tmp_path: Path) -> None:
     assert all((tmp_path / name).stat().st_size for name in names)
 
 
-@pytest.mark.parametrize("arguments", [("train", "--help"), ("conformance.cli", "--help"), ("conformance.cli", "new-adapter", "FILE")])
+@pytest.mark.parametrize(
+    "arguments", [("dreamer_spec", "--help"), ("conformance.cli", "--help"), ("conformance.cli", "new-adapter", "FILE")]
+)
 def test_output_commands_end_quietly_without_a_reader(tmp_path: Path, arguments: tuple[str, ...]) -> None:
     command = [sys.executable, "-m", *(word.replace("FILE", str(tmp_path / "file.py")) for word in arguments)]
     process = subprocess.Popen(command, cwd=ROOT, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)

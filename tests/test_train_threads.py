@@ -15,9 +15,9 @@ import train_fakes
 from train_fakes import FakeLearner
 from train_runs import Make
 
+from dreamer_spec import cgroups, loop, threads
+from dreamer_spec.envs import ContractEnv
 from spec import Image, Spaces, Vector, load_config
-from train import cgroups, loop, threads
-from train.envs import ContractEnv
 
 VECTORS = Spaces({"observation": Vector(3)}, {"action": Vector(1)})
 IMAGES = Spaces({"observation": Image(16, 16, 3)}, {"action": Vector(1)})
@@ -88,9 +88,17 @@ def place(folder: Path, files: dict[str, str]) -> None:
         ("0::/\n", {}, 8),
         ("0::/\n", {"cpu.max": "max 100000\n"}, 8),
         ("0::/\n", {"cpu.max": "350000 100000\n"}, 3),
-        ("0::/pod/box\n", {"pod/box/cpu.max": "600000 100000\n", "pod/cpu.max": "250000 100000\n", "cpu.max": "max 100000\n"}, 2),
+        (
+            "0::/pod/box\n",
+            {"pod/box/cpu.max": "600000 100000\n", "pod/cpu.max": "250000 100000\n", "cpu.max": "max 100000\n"},
+            2,
+        ),
         ("0::/pod/box\n", {"cpu.max": "50000 100000\n"}, 1),
-        ("3:cpuset:/\n1:cpu,cpuacct:/box\n0::/\n", {"cpu/box/cpu.cfs_quota_us": "400000\n", "cpu/box/cpu.cfs_period_us": "100000\n"}, 4),
+        (
+            "3:cpuset:/\n1:cpu,cpuacct:/box\n0::/\n",
+            {"cpu/box/cpu.cfs_quota_us": "400000\n", "cpu/box/cpu.cfs_period_us": "100000\n"},
+            4,
+        ),
         ("1:cpu:/\n", {"cpu/cpu.cfs_quota_us": "-1\n", "cpu/cpu.cfs_period_us": "100000\n"}, 8),
         ("0::/\n", {"cpu.max": "nonsense\n"}, 8),
     ],
@@ -103,7 +111,9 @@ def test_the_cores_of_a_container_are_those_of_its_quota(
     monkeypatch.setattr(os, "process_cpu_count", lambda: 8, raising=False)
     place(tmp_path / "cgroup", files)
     place(tmp_path, {"membership": membership})
-    monkeypatch.setattr(cgroups, "quotas", functools.partial(cgroups.quotas, tmp_path / "cgroup", tmp_path / "membership"))
+    monkeypatch.setattr(
+        cgroups, "quotas", functools.partial(cgroups.quotas, tmp_path / "cgroup", tmp_path / "membership")
+    )
     assert threads.usable_cores() == expected
 
 
@@ -133,11 +143,12 @@ USED = {
 LEARN = """
 import sys
 from spec import Spaces, Vector, load_config
-from train import threads
-from train.backend import learner_class
+from dreamer_spec import threads
+from dreamer_spec.backend import learner_class
 threads.spin_briefly()
 Learner = learner_class(sys.argv[1])
-Learner(Spaces({"x": Vector(3)}, {"a": Vector(1)}), load_config("paper", "tiny"), seed=0, device="cpu", threads=int(sys.argv[2]))
+spaces = Spaces({"x": Vector(3)}, {"a": Vector(1)})
+Learner(spaces, load_config("paper", "tiny"), seed=0, device="cpu", threads=int(sys.argv[2]))
 """
 
 
@@ -150,7 +161,9 @@ def test_a_backend_computes_with_so_many_threads(backend: str, count: int) -> No
     assert int(result.stdout) == count
 
 
-@pytest.mark.parametrize(("given", "expected"), [({}, lambda cores: max(1, cores - 1)), ({"OPENBLAS_NUM_THREADS": "5"}, lambda cores: 5)])
+@pytest.mark.parametrize(
+    ("given", "expected"), [({}, lambda cores: max(1, cores - 1)), ({"OPENBLAS_NUM_THREADS": "5"}, lambda cores: 5)]
+)
 def test_the_command_limits_numpy_before_it_is_imported(given: dict[str, str], expected: Callable[[int], int]) -> None:
     """Preflight took 42 s instead of 6 s on busy cores."""
     code = """
@@ -161,12 +174,14 @@ class Watching:
             import os
             print(os.environ.get("OPENBLAS_NUM_THREADS"))
 sys.meta_path.insert(0, Watching())
-import train.cli, train.threads
-print(train.threads.usable_cores())
+import dreamer_spec.cli, dreamer_spec.threads
+print(dreamer_spec.threads.usable_cores())
 """
     environment = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"} | given
     root = Path(__file__).parent.parent
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment, cwd=root)
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment, cwd=root
+    )
     said, cores = map(int, result.stdout.split())
     assert said == expected(cores)
 
@@ -174,9 +189,13 @@ print(train.threads.usable_cores())
 class Telling(train_fakes.Counting):
     """Shows how many threads its process is allowed to use for linear algebra."""
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
         super().reset(seed=seed)
-        return np.float32([int(os.environ.get("OPENBLAS_NUM_THREADS", -1)), multiprocessing.parent_process() is not None]), {}
+        return np.float32(
+            [int(os.environ.get("OPENBLAS_NUM_THREADS", -1)), multiprocessing.parent_process() is not None]
+        ), {}
 
 
 def make_telling(index: int) -> ContractEnv:
@@ -188,7 +207,8 @@ def test_an_environment_has_one_thread_in_its_process() -> None:
     command = [
         sys.executable,
         "-c",
-        "import test_train_threads as t\nfrom train.envs import Environments\nenvs = Environments(t.make_telling, 1, True)\n"
+        "import test_train_threads as t\nfrom dreamer_spec.envs import Environments\nenvs = "
+        "Environments(t.make_telling, 1, True)\n"
         "print(envs.reset([0])['observation'].tolist())\nenvs.close()",
     ]
     environment = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}

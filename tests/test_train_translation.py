@@ -1,4 +1,5 @@
-"""Training, evaluation and an exported policy act alike in every kind of space, and a run goes on in the same environment only."""
+"""Training, evaluation and an exported policy act alike in every kind of space, and a run goes on in the same
+environment only."""
 
 import copy
 import json
@@ -15,12 +16,12 @@ from gymnasium import spaces as gym
 from train_fakes import FakeLearner
 from train_runs import Make, run_quietly
 
-from train import resume, setup
-from train.cli import main
-from train.envs import ContractEnv, translate, trial
-from train.errors import UserError
-from train.policy import Policy
-from train.translation import Translation
+from dreamer_spec import resume, setup
+from dreamer_spec.cli import main
+from dreamer_spec.envs import ContractEnv, translate, trial
+from dreamer_spec.errors import UserError
+from dreamer_spec.policy import Policy
+from dreamer_spec.translation import Translation
 
 ROOT = Path(__file__).resolve().parent.parent
 F4, U1, I8 = np.float32, np.uint8, np.int64
@@ -42,7 +43,9 @@ class Kinds(gymnasium.Env[Any, Any]):
             "vector": gym.Box(-np.inf, np.inf, (2, 3), np.float64),
             "scalar": gym.Box(-1, 1, (), F4),
             "flags": gym.Box(0, 1, (4,), bool),
-            "body": gym.Tuple([gym.Discrete(5, start=-3), gym.Dict({"items": gym.MultiDiscrete([[2, 3]], start=[[1, -1]])})]),
+            "body": gym.Tuple(
+                [gym.Discrete(5, start=-3), gym.Dict({"items": gym.MultiDiscrete([[2, 3]], start=[[1, -1]])})]
+            ),
             "touch": gym.MultiBinary((2, 2)),
             "notes": gym.Text(5),
         }
@@ -52,14 +55,18 @@ class Kinds(gymnasium.Env[Any, Any]):
             "bounded": gym.Box(np.array([[-3, 0.1]]), np.array([[1, 0.3]]), dtype=np.float64),
             "single": gym.Box(0, 5, (2,), F4),
             "half": gym.Box(-2, 2, (1,), np.float16),
-            "open": gym.Box(np.array([-np.inf, 0, -np.inf, -1e10]), np.array([np.inf, np.inf, 5, 1e10]), dtype=np.float64),
+            "open": gym.Box(
+                np.array([-np.inf, 0, -np.inf, -1e10]), np.array([np.inf, np.inf, 5, 1e10]), dtype=np.float64
+            ),
             "scalar": gym.Box(-1, 1, (), F4),
             "discrete": gym.Discrete(4, start=-2),
             "several": gym.MultiDiscrete([[2, 3], [4, 2]], start=[[0, 1], [-5, 9]]),
             "binary": gym.MultiBinary(3),
             "whole": gym.Box(np.array([[-1, 7]]), np.array([[1, 7]]), dtype=np.int16),
             "switch": gym.Box(0, 1, (2,), bool),
-            "nested": gym.Tuple([gym.Dict({"left": gym.Discrete(2), "right": gym.Box(0, 9, (1,), F4)}), gym.Discrete(2, start=1)]),
+            "nested": gym.Tuple(
+                [gym.Dict({"left": gym.Discrete(2), "right": gym.Box(0, 9, (1,), F4)}), gym.Discrete(2, start=1)]
+            ),
         }
     )
 
@@ -95,7 +102,8 @@ def bits(value: Any) -> Any:
 
 @pytest.mark.covers("LOOP-12", "LOOP-31", "LOOP-60", "LOOP-68", "CON-34")
 def test_training_evaluation_and_an_exported_policy_act_alike(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each flat action, and each observation, that passed the environment of a run or of `train eval` is what the policy folder makes."""
+    """Each flat action, and each observation, that passed the environment of a run or of `train eval` is what the
+    policy folder makes."""
     monkeypatch.setattr(sys, "path", [str(ROOT / "tests"), *sys.path])
     passed: list[tuple[np.ndarray, Any, dict[str, np.ndarray], Any]] = []  # flat action, received; arrays, returned
     step = ContractEnv.step
@@ -108,12 +116,20 @@ def test_training_evaluation_and_an_exported_policy_act_alike(tmp_path: Path, mo
     monkeypatch.setattr(ContractEnv, "step", watched)
     monkeypatch.setattr(trial, "SLOW_STEP", 1e9)  # What is evaluated is evaluated in this process.
     run, folder = str(tmp_path / "run"), tmp_path / "policy"
-    words = "--size tiny --deter 16 --units 8 --stoch 3 --classes 5 --bins 31 --envs 2 --batch-size 2 --batch-length 4 --replay-ratio 1"
-    words += " --steps 40 --image-size 16 --leave-out notes --env-arg length=6 --no-preflight --processes no --eval-episodes 0"
+    words = (
+        "--size tiny --deter 16 --units 8 --stoch 3 --classes 5 --bins 31 --envs 2 --batch-size 2 "
+        "--batch-length 4 --replay-ratio 1"
+    )
+    words += (
+        " --steps 40 --image-size 16 --leave-out notes --env-arg length=6 "
+        "--no-preflight --processes no --eval-episodes 0"
+    )
     words += " --random-episodes 0 --compute-dtype float32"
     assert main(["--backend", "torch", "--task", "test_train_translation:Kinds", "--logdir", run, *words.split()]) == 0
     trained = len(passed)
-    assert main(["eval", run, "--episodes", "1", "--task", "test_train_translation:Kinds"]) == 0  # One is played in this process.
+    assert (
+        main(["eval", run, "--episodes", "1", "--task", "test_train_translation:Kinds"]) == 0
+    )  # One is played in this process.
     assert trained >= 30
     assert len(passed) - trained == 6
     assert main(["export", run, str(folder)]) == 0
@@ -185,7 +201,11 @@ def test_a_description_that_does_not_fit_is_refused(place: tuple[str, ...], valu
     [
         ("action_space", gym.Box(F4([0, -np.inf]), F4([20, np.inf])), ["actions action", "20.0", "10.0"]),
         ("observation_space", gym.Box(-np.inf, np.inf, (2, 1), F4), ["observations observation", "[2, 1]"]),
-        ("observation_space", gym.Dict({"observation": gym.Box(-np.inf, np.inf, (2,), F4)}), ["observations observation", "path"]),
+        (
+            "observation_space",
+            gym.Dict({"observation": gym.Box(-np.inf, np.inf, (2,), F4)}),
+            ["observations observation", "path"],
+        ),
     ],
 )
 def test_a_run_goes_on_in_the_same_environment_only(

@@ -1,4 +1,5 @@
-"""`train eval --video`: the first episode of an environment, as a film that can be looked at and never grows without bound."""
+"""`train eval --video`: the first episode of an environment, as a film that can be looked at and never grows without
+bound."""
 
 import sys
 from pathlib import Path
@@ -13,12 +14,12 @@ from PIL import ImageSequence
 from train_agents import save_checkpoint
 from train_fakes import EPISODE, FakeLearner
 
-import train.setup
+import dreamer_spec.setup
+from dreamer_spec import video
+from dreamer_spec.cli import main
+from dreamer_spec.envs import make_env
+from dreamer_spec.video import Film
 from spec import Config, Image, Spaces, Vector, load_config
-from train import video
-from train.cli import main
-from train.envs import make_env
-from train.video import Film
 
 
 class Rendering(train_fakes.Counting):
@@ -57,7 +58,7 @@ ACTION = {"action": Vector(2)}
 @pytest.fixture
 def play(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Any:
     """Runs `train eval` on a task of this module with a learner that acts randomly: its exit code, and what it said."""
-    monkeypatch.setattr(train.setup, "learner_class", lambda backend: FakeLearner)
+    monkeypatch.setattr(dreamer_spec.setup, "learner_class", lambda backend: FakeLearner)
     monkeypatch.setattr(FakeLearner, "load_state_dict", lambda self, state: None)
 
     def run(name: str, path: str, spaces: Spaces | None = None, config: Config = CONFIG) -> tuple[int, str]:
@@ -104,7 +105,9 @@ def test_without_rendering_it_shows_what_the_agent_sees(play: Any, tmp_path: Pat
         ("Dark", "film.gif", ["render raised ZeroDivisionError: no light"]),
     ],
 )
-def test_what_cannot_be_filmed_is_said_in_a_line(play: Any, tmp_path: Path, name: str, path: str, words: list[str]) -> None:
+def test_what_cannot_be_filmed_is_said_in_a_line(
+    play: Any, tmp_path: Path, name: str, path: str, words: list[str]
+) -> None:
     code, said = play(name, path)
     assert code == 2
     error = said.splitlines()[-1]
@@ -158,14 +161,15 @@ def test_only_the_first_episode_that_comes_to_its_end_is_kept(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize(
-    ("shape", "size"), [((500, 1000), (160, 320)), ((64, 64), (320, 320)), ((201, 99), (200, 100)), ((8, 8), (320, 320))]
+    ("shape", "size"),
+    [((500, 1000), (160, 320)), ((64, 64), (320, 320)), ((201, 99), (200, 100)), ((8, 8), (320, 320))],
 )
 def test_frames_have_a_handy_size(shape: tuple[int, int], size: tuple[int, int]) -> None:
     assert video._fitted(np.zeros((*shape, 3), np.uint8)).shape[:2] == size
 
 
 def test_a_gymnasium_id_is_made_to_render() -> None:
-    from train.envs import make_env
+    from dreamer_spec.envs import make_env
 
     env = make_env("gym:CartPole-v1", render=True)
     env.reset(seed=0)

@@ -1,4 +1,4 @@
-"""Environments that crash, raise, hang or return garbage: what `train.envs.Environments` makes of them."""
+"""Environments that crash, raise, hang or return garbage: what `dreamer_spec.envs.Environments` makes of them."""
 
 import functools
 import os
@@ -12,12 +12,12 @@ import train_fakes
 from gymnasium import spaces as gym
 from train_fakes import EPISODE, Fragile
 
+from dreamer_spec import cli
+from dreamer_spec.envs import ContractEnv, Environments, make_env, vector
+from dreamer_spec.envs.worker import OwnProcess
+from dreamer_spec.errors import UserError
+from dreamer_spec.evaluation import play
 from reference_numpy.training_loop import derive_seed
-from train import cli
-from train.envs import ContractEnv, Environments, make_env, vector
-from train.envs.worker import OwnProcess
-from train.errors import UserError
-from train.evaluation import play
 
 SEEDS = [3, 4, 5]
 VICTIM = 1
@@ -79,7 +79,12 @@ def test_a_failed_environment_begins_anew_and_the_others_do_not_notice(make: Mak
     (failure,) = envs.take_failures()
     assert (failure.worker, failure.kind) == (VICTIM, kind)
     assert "task train_fakes:Fragile, environment 1, step 7: " in failure.message
-    words = {"error": "ZeroDivisionError: inside", "garbage": "the reward is nan", "timeout": "within 3 seconds", "crash": "SIGKILL"}
+    words = {
+        "error": "ZeroDivisionError: inside",
+        "garbage": "the reward is nan",
+        "timeout": "within 3 seconds",
+        "crash": "SIGKILL",
+    }
     assert words[kind] in failure.message
     assert ("train_fakes.py" in failure.details) == (kind == "error")
     assert envs.take_failures() == []
@@ -89,7 +94,10 @@ def test_processes_change_nothing(make: Make) -> None:
     first, second = (make("Maze", 2, processes) for processes in (False, True))
     action = np.tile(np.float32([0, 1, 0, 0.5, -0.5]), (2, 1))
     streams = [[envs.reset([0, 1]), *(envs.step(action) for _ in range(20))] for envs in (first, second)]
-    ours, theirs = ([[(key, value.dtype, value.tobytes()) for key, value in record.items()] for record in records] for records in streams)
+    ours, theirs = (
+        [[(key, value.dtype, value.tobytes()) for key, value in record.items()] for record in records]
+        for records in streams
+    )
     assert ours == theirs
 
 
@@ -127,7 +135,13 @@ def test_too_many_failures_stop_the_run_with_the_workers_traceback(make: Make, p
     envs.step(trouble("error", 1, 2))
     with pytest.raises(UserError) as error:
         envs.step(trouble("error", 0, 2))
-    words = ["task train_fakes:Fragile, environment 0, step 2: ", "ZeroDivisionError", "failed 3 times", "2 are allowed", "--env-failures"]
+    words = [
+        "task train_fakes:Fragile, environment 0, step 2: ",
+        "ZeroDivisionError",
+        "failed 3 times",
+        "2 are allowed",
+        "--env-failures",
+    ]
     assert all(word in str(error.value) for word in words), error.value
     assert error.value.details.startswith("Traceback")
     assert error.value.details.endswith("ZeroDivisionError: inside\nthe environment\n")
@@ -137,7 +151,9 @@ def test_too_many_failures_stop_the_run_with_the_workers_traceback(make: Make, p
 def test_failures_are_told_in_the_order_of_the_environments(make: Make) -> None:
     envs = make("Fragile", 2, True)
     envs.reset([0, 1])
-    envs.step(trouble("error", 0, 2) + trouble("error", 1, 2) + np.float32([[0.2, 0], [0, 0]]))  # The first takes a second.
+    envs.step(
+        trouble("error", 0, 2) + trouble("error", 1, 2) + np.float32([[0.2, 0], [0, 0]])
+    )  # The first takes a second.
     assert [failure.worker for failure in envs.take_failures()] == [0, 1]
 
 
@@ -191,10 +207,13 @@ def spoil(how: str, index: int) -> ContractEnv:
 @pytest.mark.parametrize(("how", "attempts"), [("make", 3), ("reset", 3), ("spaces", 1)])
 @pytest.mark.covers("LOOP-46")
 def test_an_environment_that_gives_no_first_record_stops_the_run(how: str, attempts: int, processes: bool) -> None:
-    """In three attempts, or at once where others would end alike. The first one has been made already: another is the trouble."""
+    """In three attempts, or at once where others would end alike. The first one has been made already: another is the
+    trouble."""
     envs = Environments(functools.partial(spoil, how), 2, processes)
     try:
-        with pytest.raises(UserError, match="environment 1 is not like the first" if how == "spaces" else "no such level") as error:
+        with pytest.raises(
+            UserError, match="environment 1 is not like the first" if how == "spaces" else "no such level"
+        ) as error:
             envs.reset([0, 1])
         assert ("(3 attempts)" in str(error.value)) == (attempts == 3)
         assert ("test_train_workers.py" in error.value.details) == (how != "spaces")
@@ -295,7 +314,9 @@ def test_an_abandoned_episode_has_no_score(make: Make, processes: bool) -> None:
     assert EPISODE == 4
 
 
-def test_details_of_an_error_are_printed_before_its_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_details_of_an_error_are_printed_before_its_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     def fail(arguments: object) -> None:
         raise UserError("one line\nonly", "Traceback:\n  File ...\n")
 

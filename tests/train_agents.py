@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 
 from conformance.problems import random_state
+from dreamer_spec import checkpoint
+from dreamer_spec.options import Options
+from dreamer_spec.state import Counters
+from dreamer_spec.translation import Entry, Target, Translation
 from reference_numpy.agent import flatten_state
 from spec import Config, Discrete, Image, Spaces, Vector
-from train import checkpoint
-from train.options import Options
-from train.state import Counters
-from train.translation import Entry, Target, Translation
 
 
 def random_learner_state(config: Config, spaces: Spaces, seed: int = 0) -> dict[str, np.ndarray]:
@@ -21,7 +21,8 @@ def random_learner_state(config: Config, spaces: Spaces, seed: int = 0) -> dict[
 
 
 def plain_translation(spaces: Spaces) -> Translation:
-    """Of a task whose values have the form of the spaces already: a Dict, or where a key is `observation` or `action` that alone."""
+    """Of a task whose values have the form of the spaces already: a Dict, or where a key is `observation` or `action`
+    that alone."""
 
     def entry(key: str, space: Target, acts: bool) -> Entry:
         path = () if key in ("observation", "action") else (key,)

@@ -1,4 +1,5 @@
-"""Environments and a learner that the tests of `train` look through: every number that comes out says where it came from."""
+"""Environments and a learner that the tests of `train` look through: every number that comes out says where it came
+from."""
 
 import multiprocessing
 import os
@@ -11,8 +12,8 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces as gym
 
+from dreamer_spec.envs import random_actions
 from spec import Config, Image, Spaces
-from train.envs import random_actions
 
 EPISODE = 4  # steps of an episode of `Counting`, the reset not counted
 
@@ -31,7 +32,9 @@ class Counting(gymnasium.Env[Any, Any]):
         self._episode, self._time = -1, 0
         self.actions: list[np.ndarray] = []
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
         super().reset(seed=seed)
         self._episode, self._time = self._episode + 1, 0
         self._buffer[:] = self._episode, 0
@@ -43,7 +46,13 @@ class Counting(gymnasium.Env[Any, Any]):
         self._time += 1
         self._buffer[:] = self._episode, self._time
         end = self._time == EPISODE
-        return self._buffer, 10.0 * self._episode + self._time, end and self._episode % 2 == 0, end and self._episode % 2 == 1, {}
+        return (
+            self._buffer,
+            10.0 * self._episode + self._time,
+            end and self._episode % 2 == 0,
+            end and self._episode % 2 == 1,
+            {},
+        )
 
 
 class Everything(gymnasium.Env[Any, Any]):
@@ -104,7 +113,13 @@ class Faulty(Counting):
             return observation, reward, terminated, truncated, info
         if "error" in self._wrong:
             raise self._wrong["error"]
-        result = (self._wrong.get("observation", observation), self._wrong.get("reward", reward), terminated, truncated, info)
+        result = (
+            self._wrong.get("observation", observation),
+            self._wrong.get("reward", reward),
+            terminated,
+            truncated,
+            info,
+        )
         return result[: self._wrong.get("values", 5)]
 
 
@@ -138,7 +153,8 @@ def wrong_shape() -> gymnasium.Env[Any, Any]:
 
 
 class FakeLearner:
-    """Obeys train/backend.py in NumPy: random actions, latents that say which call made them, and a diary of what it was given."""
+    """Obeys dreamer_spec/backend.py in NumPy: random actions, latents that say which call made them, and a diary of
+    what it was given."""
 
     diary: ClassVar[list[tuple[str, Any]]] = []
     seeds: ClassVar[list[tuple[str, int]]] = []
@@ -188,7 +204,16 @@ class FakeLearner:
 
     def train_step(self, batch: Mapping[str, np.ndarray], seed: int) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         """The latents that are to be written back are 1000 + the number of the train step."""
-        assert set(batch) == {*self._spaces.observations, "reward", "is_first", "is_last", "is_terminal", "prev_action", "deter", "stoch"}
+        assert set(batch) == {
+            *self._spaces.observations,
+            "reward",
+            "is_first",
+            "is_last",
+            "is_terminal",
+            "prev_action",
+            "deter",
+            "stoch",
+        }
         self._train_steps += 1
         self.seeds.append(("train", seed))
         self.diary.append(("train", {key: value.copy() for key, value in batch.items()}))
@@ -200,7 +225,12 @@ class FakeLearner:
         }
 
     def predict(
-        self, observation: Mapping[str, np.ndarray], prev_action: np.ndarray, is_first: np.ndarray, context: int, seed: int
+        self,
+        observation: Mapping[str, np.ndarray],
+        prev_action: np.ndarray,
+        is_first: np.ndarray,
+        context: int,
+        seed: int,
     ) -> dict[str, np.ndarray]:
         """The reward that is predicted is the number of the step; everything else is 0.5."""
         self.seeds.append(("predict", seed))
@@ -235,12 +265,15 @@ class FakeLearner:
 class Fragile(Counting):
     """`Counting` whose second observation is random.
 
-    What the first number of an action has above 5 is the seconds that it takes. If the second is a key of TROUBLES, it gives that trouble.
+    What the first number of an action has above 5 is the seconds that it takes. If the second is a key of TROUBLES, it
+    gives that trouble.
     """
 
     TROUBLES: ClassVar[dict[float, str]] = {0.25: "error", 0.5: "garbage", 0.75: "timeout", 1.0: "crash"}
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
         observation, info = super().reset(seed=seed)
         observation[1] = self.np_random.random()
         return observation, info
@@ -299,7 +332,9 @@ class Maze(gymnasium.Env[Any, Any]):
 class Unrepeatable(Counting):
     """No two episodes are the same, whatever their seeds."""
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
         observation, info = super().reset(seed=seed)
         observation[1] = time.perf_counter() % 1
         return observation, info

@@ -8,11 +8,20 @@ from typing import Any
 import numpy as np
 from train_fakes import FakeLearner
 
-from train import loop, setup
-from train.logger import iterate_metrics
-from train.options import Options
+from dreamer_spec import loop, setup
+from dreamer_spec.logger import iterate_metrics
+from dreamer_spec.options import Options
 
-SMALL = {"deter": 8, "units": 4, "stoch": 2, "classes": 2, "batch_size": 2, "batch_length": 3, "envs": 2, "replay_capacity": 500}
+SMALL = {
+    "deter": 8,
+    "units": 4,
+    "stoch": 2,
+    "classes": 2,
+    "batch_size": 2,
+    "batch_length": 3,
+    "envs": 2,
+    "replay_capacity": 500,
+}
 BATCH_STEPS = SMALL["batch_size"] * SMALL["batch_length"]
 
 Make = Callable[..., Options]

@@ -1,4 +1,5 @@
-"""Environments that misbehave outside of Python's usual ways, and real runs of them: for tests of what surrounds a run."""
+"""Environments that misbehave outside of Python's usual ways, and real runs of them: for tests of what surrounds a
+run."""
 
 import ctypes
 import hashlib
@@ -15,14 +16,23 @@ import numpy as np
 from train_fakes import Counting
 
 ROOT = Path(__file__).parent.parent
-SIZES = {"deter": 8, "units": 4, "stoch": 2, "classes": 2, "batch-size": 2, "batch-length": 3, "envs": 2, "replay-capacity": 500}
+SIZES = {
+    "deter": 8,
+    "units": 4,
+    "stoch": 2,
+    "classes": 2,
+    "batch-size": 2,
+    "batch-length": 3,
+    "envs": 2,
+    "replay-capacity": 500,
+}
 
 # The command as it is, but for a learner that needs no backend; a preflight that lasts, if PREFLIGHT says so.
 COMMAND = """
 import os, signal, sys
 if hasattr(signal, "SIGHUP"):
     signal.signal(signal.SIGHUP, signal.SIG_DFL)  # Under nohup it would be ignored.
-from train import cli, setup
+from dreamer_spec import cli, setup
 from train_fakes import FakeLearner
 from train_surroundings import arrive
 setup.learner_class = lambda backend: FakeLearner
@@ -114,7 +124,8 @@ class Grasping(Counting):
 
 
 class Unruly(Counting):
-    """Goes elsewhere, closes the outputs and puts another in their place, and leaves a thread behind: once in a process."""
+    """Goes elsewhere, closes the outputs and puts another in their place, and leaves a thread behind: once in a
+    process."""
 
     done = False
 
@@ -169,10 +180,26 @@ def start(
 ) -> "subprocess.Popen[str]":
     """A run of 60 steps with a fake learner, in a process of its own. shell: what starts "$@"."""
     sizes = [word for name, value in SIZES.items() for word in (f"--{name}", str(value))]
-    run = ["--backend", "jax", "--task", f"train_surroundings:{task}", "--steps", "60", "--logdir", str(logdir), "--log-every", "0"]
+    run = [
+        "--backend",
+        "jax",
+        "--task",
+        f"train_surroundings:{task}",
+        "--steps",
+        "60",
+        "--logdir",
+        str(logdir),
+        "--log-every",
+        "0",
+    ]
     schedule = ["--eval-every", "0", "--eval-episodes", "1", "--random-episodes", "0"]
     preflight = [] if "PREFLIGHT" in variables else ["--no-preflight"]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT / "tests"), "ARRIVED": str(logdir.with_name("arrived")), **variables}
+    environment = {
+        **os.environ,
+        "PYTHONPATH": str(ROOT / "tests"),
+        "ARRIVED": str(logdir.with_name("arrived")),
+        **variables,
+    }
     return subprocess.Popen(
         ["sh", "-c", shell, "sh", sys.executable, "-c", COMMAND, *run, *schedule, *preflight, *sizes, *more],
         cwd=ROOT,
@@ -185,7 +212,8 @@ def start(
 
 
 def arrived(process: "subprocess.Popen[str]", logdir: Path) -> int:
-    """Waits until the run has come to where it stays. The id of the process that is there: the trainer's or a worker's."""
+    """Waits until the run has come to where it stays. The id of the process that is there: the trainer's or a
+    worker's."""
     path = logdir.with_name("arrived")
     while not path.exists():
         assert process.poll() is None, process.communicate()

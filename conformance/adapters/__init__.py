@@ -1,1 +1,2 @@
-"""The adapters of our own columns. Each is imported only when it is asked for, so that no backend is needed for another."""
+"""The adapters of our own columns. Each is imported only when it is asked for, so that no backend is needed for
+another."""

@@ -14,14 +14,16 @@ from impl_jax.learner import select_device
 from spec import Config, Spaces
 
 ROWS = (transforms, distributions, layers, rssm, networks, world_model, returns, behavior, optimizer, agent)
-# Functions of layers whose first array is not of the compute dtype; other rows take float32 or better and convert it themselves.
+# Functions of layers whose first array is not of the compute dtype; other rows take float32 or better and convert it
+# themselves.
 EXACT = ("truncated_normal", "dense", "mlp")
 # Run operation by operation: their Python floats would each need a compilation.
 EAGER_ROWS = (transforms, distributions)
 
 
 class JaxAdapter:
-    """Offers every public function of impl_jax under its name, NumPy in and NumPy out, compiled except for the elementwise rows."""
+    """Offers every public function of impl_jax under its name, NumPy in and NumPy out, compiled except for the
+    elementwise rows."""
 
     def __init__(self, dtype: str, device: str | None) -> None:
         self.dtype = dtype
@@ -32,7 +34,11 @@ class JaxAdapter:
     def __getattr__(self, name: str) -> Any:
         for row in ROWS:
             function = vars(row).get(name)
-            if function is not None and not name.startswith("_") and getattr(function, "__module__", None) == row.__name__:
+            if (
+                function is not None
+                and not name.startswith("_")
+                and getattr(function, "__module__", None) == row.__name__
+            ):
                 first = jnp.bfloat16 if self.dtype == "bfloat16" and row is layers and name not in EXACT else None
                 return functools.partial(self._run, function, name, row not in EAGER_ROWS, first)
         raise AttributeError(name)
@@ -57,7 +63,17 @@ class JaxAdapter:
         return self._run(function, "imagine", True, None, params, carry, action, uniform, config)
 
     def laprop(self, gradient: Any, second_moment: Any, momentum: Any, step: int, config: Config) -> Any:
-        return self._run(optimizer.laprop, "laprop", True, None, gradient, second_moment, momentum, np.asarray(step, np.int32), config)
+        return self._run(
+            optimizer.laprop,
+            "laprop",
+            True,
+            None,
+            gradient,
+            second_moment,
+            momentum,
+            np.asarray(step, np.int32),
+            config,
+        )
 
     def gradients(self, params: Any, *rest: Any) -> Any:
         def function(params: Any, *rest: Any) -> Any:
@@ -78,12 +94,16 @@ class JaxAdapter:
         gradients = self._run(function, "loss_derivatives", True, None, *inputs)
 
         def along(gradient: Any) -> np.ndarray:
-            return np.array([sum(np.vdot(gradient[name], change) for name, change in direction.items()) for direction in directions])
+            return np.array(
+                [sum(np.vdot(gradient[name], change) for name, change in direction.items()) for direction in directions]
+            )
 
         return {name: along(gradient) for name, gradient in gradients.items()}
 
     def initial_parameters(self, table: Any, uniforms: Any) -> Any:
-        return self._run(lambda uniforms: agent.initial_parameters(table, uniforms), "initial_parameters", False, None, uniforms)
+        return self._run(
+            lambda uniforms: agent.initial_parameters(table, uniforms), "initial_parameters", False, None, uniforms
+        )
 
     def _run(self, function: Callable[..., Any], key: Any, compile_: bool, first: Any, *arguments: Any) -> Any:
         """Calls a function with configuration, spaces and plain numbers as they are, and arrays as traced arguments."""
@@ -94,10 +114,14 @@ class JaxAdapter:
 
         def call(*dynamic: Any) -> Any:
             values = iter(dynamic)
-            return function(*(argument if static else next(values) for argument, static in zip(arguments, is_static, strict=True)))
+            return function(
+                *(argument if static else next(values) for argument, static in zip(arguments, is_static, strict=True))
+            )
 
         if compile_:
-            statics = tuple(repr(argument) if static else None for argument, static in zip(arguments, is_static, strict=True))
+            statics = tuple(
+                repr(argument) if static else None for argument, static in zip(arguments, is_static, strict=True)
+            )
             call = self.compiled.setdefault((key, statics), jax.jit(call))
         with jax.default_device(self.device):
             return _to_numpy(call(*dynamic))

@@ -20,7 +20,20 @@ from reference_numpy import (
     world_model,
 )
 
-ROWS = (transforms, distributions, layers, rssm, networks, world_model, returns, behavior, optimizer, agent, replay, training_loop)
+ROWS = (
+    transforms,
+    distributions,
+    layers,
+    rssm,
+    networks,
+    world_model,
+    returns,
+    behavior,
+    optimizer,
+    agent,
+    replay,
+    training_loop,
+)
 
 
 # Unit directions: the error of the difference is about 1e-11 times the loss.
@@ -28,7 +41,8 @@ DIFFERENCE_STEP = 1e-5
 
 
 class NumpyAdapter(WithoutNoise):
-    """Offers every public function of reference_numpy under its name, looked up at each call so that a mutant takes effect."""
+    """Offers every public function of reference_numpy under its name, looked up at each call so that a mutant takes
+    effect."""
 
     def __getattr__(self, name: str) -> Any:
         if name in ("gradients", "train_step"):

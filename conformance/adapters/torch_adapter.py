@@ -8,7 +8,18 @@ from typing import Any
 import numpy as np
 import torch
 
-from impl_torch import agent, behavior, distributions, layers, networks, optimizer, returns, rssm, transforms, world_model
+from impl_torch import (
+    agent,
+    behavior,
+    distributions,
+    layers,
+    networks,
+    optimizer,
+    returns,
+    rssm,
+    transforms,
+    world_model,
+)
 from impl_torch.learner import select_device
 from impl_torch.shapes import DTYPES
 from spec import Config
@@ -56,7 +67,9 @@ class TorchAdapter:
         for name, loss in aux["losses"].items():
             by_leaf = torch.autograd.grad(loss, list(params.values()), retain_graph=True, materialize_grads=True)
             by_name = dict(zip(params, map(_leave, by_leaf), strict=True))
-            derivatives[name] = np.array([sum(np.sum(by_name[key] * np.asarray(x)) for key, x in along.items()) for along in directions])
+            derivatives[name] = np.array(
+                [sum(np.sum(by_name[key] * np.asarray(x)) for key, x in along.items()) for along in directions]
+            )
         return derivatives
 
     def _wrap(self, function: Callable[..., Any], narrow: bool = False) -> Callable[..., Any]:
@@ -64,7 +77,10 @@ class TorchAdapter:
 
         def call(*arguments: Any) -> Any:
             # A single number is an array where the function wants one. What has a default, the interface may not know.
-            arrays = (np.asarray(x) if np.isscalar(x) and kind in ARRAYS else x for x, kind in zip(arguments, wanted, strict=False))
+            arrays = (
+                np.asarray(x) if np.isscalar(x) and kind in ARRAYS else x
+                for x, kind in zip(arguments, wanted, strict=False)
+            )
             converted = [self._enter(x) for x in arrays]
             if narrow and isinstance(converted[0], torch.Tensor) and converted[0].is_floating_point():
                 converted[0] = converted[0].to(DTYPES[self._dtype])

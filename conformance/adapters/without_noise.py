@@ -10,7 +10,8 @@ from spec import Config, Discrete, Spaces, parameter_table
 
 
 class WithoutNoise:
-    """For adapters: given samples are turned into noise that draws them, and drawn samples come from noise of NumPy's generator."""
+    """For adapters: given samples are turned into noise that draws them, and drawn samples come from noise of NumPy's
+    generator."""
 
     if TYPE_CHECKING:
 
@@ -18,7 +19,14 @@ class WithoutNoise:
             """The functions that take noise are those of the other base class."""
 
     def observe_given(
-        self, params: Any, carry: Any, tokens: np.ndarray, prev_action: np.ndarray, is_first: np.ndarray, stoch: np.ndarray, config: Config
+        self,
+        params: Any,
+        carry: Any,
+        tokens: np.ndarray,
+        prev_action: np.ndarray,
+        is_first: np.ndarray,
+        stoch: np.ndarray,
+        config: Config,
     ) -> dict[str, np.ndarray]:
         deter, latent = carry["deter"], carry["stoch"]
         steps = []
@@ -26,11 +34,18 @@ class WithoutNoise:
             keep = ~is_first[:, t, None]
             action = np.where(keep, prev_action[:, t], 0)
             deter = self.core(params, np.where(keep, deter, 0), np.where(keep[..., None], latent, 0), action, config)
-            steps.append((deter, self.posterior(params, deter, tokens[:, t], config), self.prior(params, deter, config)))
+            steps.append(
+                (deter, self.posterior(params, deter, tokens[:, t], config), self.prior(params, deter, config))
+            )
             latent = stoch[:, t]
-        return {name: np.stack(values, 1) for name, values in zip(("deter", "posterior", "prior"), zip(*steps, strict=True), strict=True)}
+        return {
+            name: np.stack(values, 1)
+            for name, values in zip(("deter", "posterior", "prior"), zip(*steps, strict=True), strict=True)
+        }
 
-    def imagine_given(self, params: Any, carry: Any, action: np.ndarray, stoch: np.ndarray, config: Config) -> dict[str, np.ndarray]:
+    def imagine_given(
+        self, params: Any, carry: Any, action: np.ndarray, stoch: np.ndarray, config: Config
+    ) -> dict[str, np.ndarray]:
         deters, latent = [carry["deter"]], carry["stoch"]
         for t in range(action.shape[1]):
             deters.append(self.core(params, deters[-1], latent, action[:, t], config))
@@ -48,9 +63,14 @@ class WithoutNoise:
         """Noise that draws the given samples of a train step."""
         tokens = self.encoder(params, {key: batch[key] for key in spaces.observations}, spaces, config)
         carry = {"deter": batch["deter"], "stoch": np.eye(config.classes)[batch["stoch"]]}
-        states = self.observe_given(params, carry, tokens, batch["prev_action"], batch["is_first"], samples["posterior"], config)
+        states = self.observe_given(
+            params, carry, tokens, batch["prev_action"], batch["is_first"], samples["posterior"], config
+        )
         starts = batch["is_first"].size
-        start = {"deter": states["deter"].reshape(starts, -1), "stoch": samples["posterior"].reshape(starts, config.stoch, config.classes)}
+        start = {
+            "deter": states["deter"].reshape(starts, -1),
+            "stoch": samples["posterior"].reshape(starts, config.stoch, config.classes),
+        }
         dream = self.imagine_given(params, start, samples["action"], samples["prior"], config)
         stoch = np.concatenate([start["stoch"][:, None], samples["prior"]], 1)
         outputs = self.actor(params, feature(dream["deter"], stoch)[:, :-1], spaces, config)
@@ -71,7 +91,10 @@ class WithoutNoise:
 
     def draw_actions(self, outputs: Any, spaces: Spaces, config: Config, seed: int, n: int) -> np.ndarray:
         rng = np.random.default_rng(seed)
-        rows = {key: {name: np.broadcast_to(x, (n, *x.shape)) for name, x in values.items()} for key, values in outputs.items()}
+        rows = {
+            key: {name: np.broadcast_to(x, (n, *x.shape)) for name, x in values.items()}
+            for key, values in outputs.items()
+        }
         draws = [
             (rng.random if isinstance(space, Discrete) else rng.standard_normal)((n, *space.array_shape))
             for space in spaces.actions.values()
@@ -80,7 +103,9 @@ class WithoutNoise:
 
     def draw_parameters(self, spaces: Spaces, config: Config, seed: int) -> dict[str, np.ndarray]:
         table, rng = parameter_table(config, spaces), np.random.default_rng(seed)
-        uniforms = {name: rng.random(entry.shape) for name, entry in table.items() if entry.initializer == "truncated_normal"}
+        uniforms = {
+            name: rng.random(entry.shape) for name, entry in table.items() if entry.initializer == "truncated_normal"
+        }
         return self.initial_parameters(table, uniforms)
 
 
@@ -102,6 +127,8 @@ def action_noise_of(outputs: Any, action: np.ndarray, spaces: Spaces, config: Co
             segments = zip(np.split(outputs[key]["logits"], ends, -1), np.split(own, ends, -1), strict=True)
             parts += [uniform_of(logits, config.actor_unimix, onehot)[..., None] for logits, onehot in segments]
         else:
-            mean, std = bounded_normal(outputs[key]["mean"], outputs[key]["std"], config.actor_min_std, config.actor_max_std)
+            mean, std = bounded_normal(
+                outputs[key]["mean"], outputs[key]["std"], config.actor_min_std, config.actor_max_std
+            )
             parts.append((own - mean) / std)
     return np.concatenate(parts, -1)

@@ -25,7 +25,13 @@ from reference_numpy import agent as reference
 from spec import Discrete, Image, Spaces, load_config, parameter_table
 
 # Vectors, images and both; discrete, continuous and mixed actions.
-COMBINATIONS = (("vector", "discrete"), ("vector", "continuous"), ("image", "discrete"), ("image", "continuous"), ("both", "mixed"))
+COMBINATIONS = (
+    ("vector", "discrete"),
+    ("vector", "continuous"),
+    ("image", "discrete"),
+    ("image", "continuous"),
+    ("both", "mixed"),
+)
 SAMPLING_MARGIN = 1e-4
 WHOLE = ("float64", "float32")  # in bfloat16 a sample can fall into another class, after which nothing is comparable
 GROUPS = {
@@ -47,7 +53,8 @@ def bound_of(run: Run, double: float, single: float) -> float:
 
 @functools.lru_cache(maxsize=64)
 def safe_problem(seed: int, profile: str, observation: str, action: str, dtype: str) -> Problem:
-    """A problem in which honest rounding moves no sample into another class, and free nats clip some time steps and not others."""
+    """A problem in which honest rounding moves no sample into another class, and free nats clip some time steps and not
+    others."""
 
     def draw(attempt: int) -> Problem:
         return make_problem(1000 * seed + attempt, profile, observation, action, dtype)
@@ -83,7 +90,9 @@ def losses_match(run: Run) -> None:
         where, bound = f"{observation}, {action}: ", bound_of(run, 1e-9, 2e-4)
         run.compare(where + "losses", actual["losses"], aux["losses"], magnitude=loss_magnitude(aux), bound=bound)
         run.compare(where + "total", actual_total, total, magnitude=abs(total), bound=bound)
-        run.compare(where + "return_range", tuple(actual["return_range"]), aux["return_range"], magnitude=1.0, bound=bound)
+        run.compare(
+            where + "return_range", tuple(actual["return_range"]), aux["return_range"], magnitude=1.0, bound=bound
+        )
         run.compare(where + "deter", actual["deter"], aux["deter"], magnitude=1.0, bound=bound)
         run.exact(where + "stoch", np.round(actual["stoch"], 3), aux["stoch"].round(3))
         metrics = {name: actual["metrics"][name] for name in aux["metrics"]}
@@ -96,7 +105,9 @@ def losses_of_short_sequences_match(run: Run) -> None:
     for length in (2, 1):
 
         def draw(attempt: int, length: int = length) -> Problem:
-            return make_problem(1000 * run.seed + attempt, run.profile, "vector", "discrete", run.dtype, batch_length=length)
+            return make_problem(
+                1000 * run.seed + attempt, run.profile, "vector", "discrete", run.dtype, batch_length=length
+            )
 
         problem = with_sampling_margin(draw, SAMPLING_MARGIN)
         _, aux = reference.losses(*problem.loss_arguments)
@@ -136,7 +147,9 @@ def reference_derivatives(seed: int, profile: str, observation: str, action: str
         return np.array(list(reference.losses(params, *problem.loss_arguments[1:])[1]["losses"].values()))
 
     directions = unit_directions(problem, seed).values()
-    columns = [reference.directional_derivative(means, problem.state["params"], direction, 1e-5) for direction in directions]
+    columns = [
+        reference.directional_derivative(means, problem.state["params"], direction, 1e-5) for direction in directions
+    ]
     return dict(zip(names, np.array(columns).T, strict=True))
 
 
@@ -160,12 +173,15 @@ GRADIENT_REQUIREMENTS = (
 
 @check(*GRADIENT_REQUIREMENTS, uses=["loss_derivatives"], level=2, dtypes=WHOLE)
 def loss_derivatives_match(run: Run) -> None:
-    """The derivative of every loss along random directions and within every group of parameters; where none may flow, exactly 0."""
+    """The derivative of every loss along random directions and within every group of parameters; where none may flow,
+    exactly 0."""
     for observation, action in (("vector", "continuous"), ("both", "mixed")):
         problem = problem_of(run, observation, action)
         labels = list(unit_directions(problem, run.seed))
         expected = reference_derivatives(run.seed, run.profile, observation, action, run.dtype)
-        actual = run.call("loss_derivatives", *problem.loss_arguments, list(unit_directions(problem, run.seed).values()))
+        actual = run.call(
+            "loss_derivatives", *problem.loss_arguments, list(unit_directions(problem, run.seed).values())
+        )
         bound = bound_of(run, 1e-6, 5e-3)
         for name, derivatives in expected.items():
             where = f"{observation}, {action}: derivative of {name}"
@@ -187,7 +203,10 @@ def total_gradient_is_the_weighted_sum(run: Run) -> None:
         total = sum(weights[name] * value for name, value in expected.items())
         gradients = run.call("gradients", *problem.loss_arguments)
         run.holds("one gradient for each parameter", set(gradients) == set(problem.state["params"]))
-        products = [sum(float((gradients[name] * d).sum()) for name, d in direction.items()) for direction in directions.values()]
+        products = [
+            sum(float((gradients[name] * d).sum()) for name, d in direction.items())
+            for direction in directions.values()
+        ]
         where = f"{observation}, {action}: gradient along directions"
         run.compare(where, np.array(products), total, magnitude=np.abs(total).max(), bound=bound_of(run, 1e-6, 5e-3))
 
@@ -200,15 +219,25 @@ def compare_steps(run: Run, where: str, actual: Any, expected: Any, state: Any, 
             move = np.abs(value - state[group][name]).max() + run.u / bound * np.abs(value).max()
             run.compare(f"{where}{group} {name}", new[group][name], value, magnitude=max(move, 1e-12), bound=bound)
     for moment in ("second_moment", "momentum"):
-        run.compare(where + moment, dict(new["optimizer"][moment]), expected_new["optimizer"][moment], magnitude="tensor", bound=bound)
+        run.compare(
+            where + moment,
+            dict(new["optimizer"][moment]),
+            expected_new["optimizer"][moment],
+            magnitude="tensor",
+            bound=bound,
+        )
     range_ = {name: float(value) for name, value in new["return_range"].items()}
     run.compare(where + "return_range", range_, expected_new["return_range"], magnitude=1.0, bound=bound)
-    run.compare(where + "losses", aux["losses"], expected_aux["losses"], magnitude=loss_magnitude(expected_aux), bound=bound)
+    run.compare(
+        where + "losses", aux["losses"], expected_aux["losses"], magnitude=loss_magnitude(expected_aux), bound=bound
+    )
     run.compare(where + "deter", aux["deter"], expected_aux["deter"], magnitude=1.0, bound=bound)
     run.exact(where + "stoch", np.round(aux["stoch"], 3), expected_aux["stoch"].round(3))
 
 
-@check("AGT-29", "AGT-30", "BEH-21", "OPT-17", "OPT-21", "CON-22", uses=["train_step", "gradients"], level=3, dtypes=WHOLE)
+@check(
+    "AGT-29", "AGT-30", "BEH-21", "OPT-17", "OPT-21", "CON-22", uses=["train_step", "gradients"], level=3, dtypes=WHOLE
+)
 def train_step_matches(run: Run) -> None:
     """Parameters, moments, slow critic, return range and latents after one step, for every kind of task."""
     for observation, action in COMBINATIONS:
@@ -220,7 +249,18 @@ def train_step_matches(run: Run) -> None:
         compare_steps(run, f"{observation}, {action}: ", actual, expected, problem.state, bound_of(run, 1e-9, 2e-3))
 
 
-@check("AGT-29", "AGT-30", "AGT-31", "BEH-21", "OPT-17", "OPT-21", "CON-22", uses=["train_step_with"], level=3, dtypes=WHOLE)
+@check(
+    "AGT-29",
+    "AGT-30",
+    "AGT-31",
+    "BEH-21",
+    "OPT-17",
+    "OPT-21",
+    "CON-22",
+    uses=["train_step_with"],
+    level=3,
+    dtypes=WHOLE,
+)
 def train_step_with_given_gradients_matches(run: Run) -> None:
     """The same with given gradients; the arguments are as before."""
     problem = problem_of(run, "both", "mixed")
@@ -252,7 +292,16 @@ def policy_arguments(run: Run, rows: int = 4) -> tuple[Any, ...]:
     noise = {"posterior": uniforms(rng, rows, config.stoch), "action": action_noise(rng, task, (rows,))}
     observation = random_observations(rng, task, (rows,))
     is_first = np.arange(rows) % 2 == 1
-    return params, random_carry(rng, config, (rows,)), random_actions(rng, task, (rows,)), observation, is_first, noise, task, config
+    return (
+        params,
+        random_carry(rng, config, (rows,)),
+        random_actions(rng, task, (rows,)),
+        observation,
+        is_first,
+        noise,
+        task,
+        config,
+    )
 
 
 @check("AGT-11", "AGT-12", "BEH-8", "CON-26", "CON-27", uses=["policy_step"], level=1, dtypes=WHOLE)
@@ -265,7 +314,8 @@ def policy_step_matches(run: Run) -> None:
 
 @check("AGT-13", "RSSM-13", "RSSM-14", "CON-12", uses=["policy_step"], level=1)
 def policy_step_resets_and_rows(run: Run) -> None:
-    """Where is_first, carry and previous action change nothing, not even as NaN; and rows do not influence each other."""
+    """Where is_first, carry and previous action change nothing, not even as NaN; and rows do not influence each
+    other."""
     params, carry, prev_action, observation, is_first, noise, task, config = policy_arguments(run)
     before = run.call("policy_step", params, carry, prev_action, observation, is_first, noise, task, config)
     spoiled = {name: value.copy() for name, value in carry.items()}
@@ -285,16 +335,25 @@ def policy_step_resets_and_rows(run: Run) -> None:
 
 @check("AGT-1", "AGT-3", "AGT-4", "AGT-5", "AGT-6", uses=["initial_parameters"], level=1)
 def initial_parameters_match(run: Run) -> None:
-    """Every tensor of the table from the same uniforms; biases 0, scales 1; the standard deviations follow fan-in and outscale."""
+    """Every tensor of the table from the same uniforms; biases 0, scales 1; the standard deviations follow fan-in and
+    outscale."""
     task, config = spaces(), load_config(run.profile, "tiny", units=64, compute_dtype=run.dtype)
     table = parameter_table(config, task)
     rng = run.rng()
-    drawn = {name: uniforms(rng, *entry.shape) for name, entry in table.items() if entry.initializer == "truncated_normal"}
+    drawn = {
+        name: uniforms(rng, *entry.shape) for name, entry in table.items() if entry.initializer == "truncated_normal"
+    }
     expected = reference.initial_parameters(table, drawn)
     actual = run.call("initial_parameters", table, drawn)
     scale = {name: entry.outscale / math.sqrt(entry.fan_in) for name, entry in table.items()}
     bound = 1e-9 if run.dtype == "float64" else 3e-5
-    run.compare("initial_parameters", actual, expected, magnitude={name: max(value, 1e-12) for name, value in scale.items()}, bound=bound)
+    run.compare(
+        "initial_parameters",
+        actual,
+        expected,
+        magnitude={name: max(value, 1e-12) for name, value in scale.items()},
+        bound=bound,
+    )
     for name, entry in table.items():
         if entry.initializer == "truncated_normal" and entry.outscale > 0 and np.size(actual[name]) >= 4096:
             run.compare(f"standard deviation of {name}", np.std(actual[name]), scale[name], bound=0.1)
@@ -321,7 +380,9 @@ def a_fresh_agent_predicts_zero(run: Run) -> None:
     problem = problem_of(run, "vector", "discrete")
     table = parameter_table(problem.config, problem.spaces)
     rng = run.rng()
-    drawn = {name: uniforms(rng, *entry.shape) for name, entry in table.items() if entry.initializer == "truncated_normal"}
+    drawn = {
+        name: uniforms(rng, *entry.shape) for name, entry in table.items() if entry.initializer == "truncated_normal"
+    }
     params = run.call("initial_parameters", table, drawn)
     slow = {name: value for name, value in params.items() if name.startswith("critic/")}
     _, aux = run.call("losses", params, slow, (0.0, 0.0), problem.batch, problem.noise, problem.spaces, problem.config)

@@ -18,8 +18,11 @@ from spec import Config, Discrete, Spaces, Vector
 # Numbers in the chapter have seven digits; in bfloat16 already the rounded inputs move the results by a percent.
 LITERAL = {"float64": 1e-6, "float32": 4e-6, "bfloat16": 3e-2}
 LEADING = st.sampled_from([(), (2, 3)])
-# Given unsorted; in sorted order Aim, buttons, one, turn: 1 + 5 + 1 + 2 numbers in a flat action, 1 + 2 + 1 + 2 in its noise.
-TASK = Spaces({"x": Vector(1)}, {"turn": Vector(2), "buttons": Discrete((2, 3)), "one": Discrete((1,)), "Aim": Vector(1)})
+# Given unsorted; in sorted order Aim, buttons, one, turn: 1 + 5 + 1 + 2 numbers in a flat action, 1 + 2 + 1 + 2 in its
+# noise.
+TASK = Spaces(
+    {"x": Vector(1)}, {"turn": Vector(2), "buttons": Discrete((2, 3)), "one": Discrete((1,)), "Aim": Vector(1)}
+)
 DISCRETE = Spaces({"x": Vector(1)}, {"action": Discrete((2,))})
 CONTINUOUS = Spaces({"x": Vector(1)}, {"action": Vector(1)})
 
@@ -27,8 +30,16 @@ CONTINUOUS = Spaces({"x": Vector(1)}, {"action": Vector(1)})
 def random_outputs(run: Run, seed: int, leading: tuple[int, ...], scale: float) -> dict[str, dict[str, np.ndarray]]:
     """Raw actor outputs of TASK."""
     rng = np.random.default_rng(seed)
-    sizes = {"Aim": {"mean": 1, "std": 1}, "buttons": {"logits": 5}, "one": {"logits": 1}, "turn": {"mean": 2, "std": 2}}
-    return {key: {name: run.cast(rng.normal(0, scale, (*leading, n))) for name, n in names.items()} for key, names in sizes.items()}
+    sizes = {
+        "Aim": {"mean": 1, "std": 1},
+        "buttons": {"logits": 5},
+        "one": {"logits": 1},
+        "turn": {"mean": 2, "std": 2},
+    }
+    return {
+        key: {name: run.cast(rng.normal(0, scale, (*leading, n))) for name, n in names.items()}
+        for key, names in sizes.items()
+    }
 
 
 def config_of(run: Run, **overrides: Any) -> Config:
@@ -51,14 +62,17 @@ def log_prob_magnitude(outputs: Any, action: np.ndarray, config: Config) -> np.n
     """The sum of the magnitudes of all terms of a log-probability."""
     size = 20 + 2 * np.ptp(outputs["buttons"]["logits"], -1)
     for key, part in (("Aim", action[..., :1]), ("turn", action[..., 7:])):
-        mean, std = distributions.bounded_normal(outputs[key]["mean"], outputs[key]["std"], config.actor_min_std, config.actor_max_std)
+        mean, std = distributions.bounded_normal(
+            outputs[key]["mean"], outputs[key]["std"], config.actor_min_std, config.actor_max_std
+        )
         size = size + (0.5 * ((np.abs(part) + np.abs(mean)) / std) ** 2 + np.abs(np.log(std)) + 1).sum(-1)
     return size
 
 
 @check("BEH-1", "BEH-2", "BEH-3", "CON-19", "CON-25", "CON-26", "CON-27", uses=["sample_action"], level=0)
 def action_literals(run: Run) -> None:
-    """Noise and action follow the sorted keys; each entry has its own segment; a sample of 3 standard deviations is not clipped."""
+    """Noise and action follow the sorted keys; each entry has its own segment; a sample of 3 standard deviations is not
+    clipped."""
     config = config_of(run, actor_unimix=0.01, actor_min_std=0.25, actor_max_std=0.25)
     outputs = {
         "turn": {"mean": np.array([0.0, -30]), "std": np.zeros(2)},
@@ -66,7 +80,8 @@ def action_literals(run: Run) -> None:
         "buttons": {"logits": np.array([0.0, 0, 0, 0, 60])},
         "Aim": {"mean": np.array([30.0]), "std": np.zeros(1)},
     }
-    # Aim: 1 + 3/4. Buttons: 0.75 of (1/2, 1/2) and 0.25 of (0, 0, 1). One: its uniform is consumed. Turn: 0 + 1/2 and -1 - 1.
+    # Aim: 1 + 3/4. Buttons: 0.75 of (1/2, 1/2) and 0.25 of (0, 0, 1). One: its uniform is consumed. Turn: 0 + 1/2 and
+    # -1 - 1.
     noise = np.array([3.0, 0.75, 0.25, 0.875, 2.0, -4.0])
     expected = np.array([1.75, 0, 1, 0, 0, 1, 1, 0.5, -2])
     run.expect("sample_action", (outputs, noise, TASK, config), expected, magnitude=1.0, bound=16 * run.u)
@@ -76,10 +91,16 @@ def action_literals(run: Run) -> None:
     )  # fmt: skip
 
 
-@check("BEH-2", "BEH-3", "BEH-6", "BEH-7", "DIS-7", uses=["sample_action", "action_log_prob", "action_entropy"], level=0)
+@check(
+    "BEH-2", "BEH-3", "BEH-6", "BEH-7", "DIS-7", uses=["sample_action", "action_log_prob", "action_entropy"], level=0
+)
 def discrete_literals(run: Run) -> None:
-    """Logits ln 3, 0 with 1 percent uniform: 0.7475 and 0.2525, boundary at 0.7475, log-probabilities and entropy of the mixture."""
-    config, outputs = config_of(run, actor_unimix=0.01), {"action": {"logits": run.cast(np.tile([math.log(3), 0], (4, 1)))}}
+    """Logits ln 3, 0 with 1 percent uniform: 0.7475 and 0.2525, boundary at 0.7475, log-probabilities and entropy of
+    the mixture."""
+    config, outputs = (
+        config_of(run, actor_unimix=0.01),
+        {"action": {"logits": run.cast(np.tile([math.log(3), 0], (4, 1)))}},
+    )
     sample = run.call("sample_action", outputs, run.cast(np.array([[0], [0.74], [0.758], [0.99]])), DISCRETE, config)
     run.exact("sample", sample, np.eye(2)[[0, 0, 1, 1]])
     bound = LITERAL[run.dtype]
@@ -90,19 +111,27 @@ def discrete_literals(run: Run) -> None:
     plain = config_of(run, actor_unimix=0.0)
     expected = np.log([0.75, 0.25, 0.75, 1])
     run.expect("action_log_prob", (outputs, actions, DISCRETE, plain), expected, magnitude=1.0, bound=bound)
-    # Far logits: finite log-probabilities without the mixture, a floor of ln(u/C) with it; probability 0 has no entropy.
+    # Far logits: finite log-probabilities without the mixture, a floor of ln(u/C) with it; probability 0 has no
+    # entropy.
     far, second = {"action": {"logits": np.array([1000.0, 0])}}, np.array([0.0, 1])
     run.expect("action_log_prob", (far, second, DISCRETE, plain), -1000.0, bound=16 * run.u)
     run.expect("action_log_prob", (far, second, DISCRETE, config), math.log(0.005), bound=16 * run.u)
-    run.exact("entropy of certainty", run.call("action_entropy", {"action": {"logits": np.array([0, -np.inf])}}, DISCRETE, plain), 0.0)
+    run.exact(
+        "entropy of certainty",
+        run.call("action_entropy", {"action": {"logits": np.array([0, -np.inf])}}, DISCRETE, plain),
+        0.0,
+    )
 
 
 @check("BEH-4", "BEH-6", "BEH-7", "CON-18", uses=["sample_action", "action_log_prob", "action_entropy"], level=0)
 def continuous_literals(run: Run) -> None:
-    """Raw 0, 0 and the normal 1.5: action 1.339076, log-density -1.930453, entropy 1.305453; narrow normals have negative entropy."""
+    """Raw 0, 0 and the normal 1.5: action 1.339076, log-density -1.930453, entropy 1.305453; narrow normals have
+    negative entropy."""
     bound, config = LITERAL[run.dtype], config_of(run, actor_min_std=0.1, actor_max_std=1.0)
     outputs = {"action": {"mean": np.zeros(1), "std": np.zeros(1)}}
-    run.expect("sample_action", (outputs, np.array([1.5]), CONTINUOUS, config), np.array([1.339076]), bound=LITERAL["float32"])
+    run.expect(
+        "sample_action", (outputs, np.array([1.5]), CONTINUOUS, config), np.array([1.339076]), bound=LITERAL["float32"]
+    )
     run.expect("action_log_prob", (outputs, run.cast([1.339076]), CONTINUOUS, config), -1.930453, bound=bound)
     run.expect("action_entropy", (outputs, CONTINUOUS, config), 1.305453, bound=LITERAL["float32"])
     for raw, entropy in ((-100.0, -0.883647), (100.0, 1.418939)):
@@ -114,20 +143,30 @@ def continuous_literals(run: Run) -> None:
 def actions_match(run: Run) -> None:
     """Actions of several keys, any leading axes, sharp and flat outputs, any mixture and deviation."""
 
-    @run.for_all(seed=seeds(), leading=LEADING, scale=st.sampled_from([0.5, 4.0]), unimix=st.sampled_from([0.0, 0.01, 0.5]))
+    @run.for_all(
+        seed=seeds(), leading=LEADING, scale=st.sampled_from([0.5, 4.0]), unimix=st.sampled_from([0.0, 0.01, 0.5])
+    )
     def _(seed: int, leading: tuple[int, ...], scale: float, unimix: float) -> None:
         config = config_of(run, actor_unimix=unimix, actor_max_std=2.0)
         outputs = random_outputs(run, seed, leading, scale)
         noise = safe_noise(run, seed, outputs, leading, config)
         expected = reference.sample_action(outputs, noise, TASK, config)
-        run.expect("sample_action", (outputs, noise, TASK, config), expected, magnitude=1 + 2 * np.abs(expected), bound=16 * run.u)
+        run.expect(
+            "sample_action",
+            (outputs, noise, TASK, config),
+            expected,
+            magnitude=1 + 2 * np.abs(expected),
+            bound=16 * run.u,
+        )
 
 
 @check("BEH-2", "BEH-4", "BEH-6", "BEH-7", "BEH-22", uses=["action_log_prob", "action_entropy"], level=0)
 def log_prob_and_entropy_match(run: Run) -> None:
     """Sums over keys, entries and dimensions of any action, also of one far from the mean and of a blanked one."""
 
-    @run.for_all(seed=seeds(), leading=LEADING, scale=st.sampled_from([0.5, 4.0, 60.0]), unimix=st.sampled_from([0.0, 0.01, 0.5]))
+    @run.for_all(
+        seed=seeds(), leading=LEADING, scale=st.sampled_from([0.5, 4.0, 60.0]), unimix=st.sampled_from([0.0, 0.01, 0.5])
+    )
     def _(seed: int, leading: tuple[int, ...], scale: float, unimix: float) -> None:
         config = config_of(run, actor_unimix=unimix, actor_min_std=0.05)
         outputs = random_outputs(run, seed, leading, scale)
@@ -138,12 +177,15 @@ def log_prob_and_entropy_match(run: Run) -> None:
         expected = reference.action_log_prob(outputs, action, TASK, config)
         run.expect("action_log_prob", (outputs, action, TASK, config), expected, magnitude=magnitude, bound=16 * run.u)
         expected = reference.action_entropy(outputs, TASK, config)
-        run.expect("action_entropy", (outputs, TASK, config), expected, magnitude=np.abs(expected) + 20, bound=16 * run.u)
+        run.expect(
+            "action_entropy", (outputs, TASK, config), expected, magnitude=np.abs(expected) + 20, bound=16 * run.u
+        )
 
 
 @check("BEH-9", uses=["actor_loss"], level=0)
 def actor_loss_literals(run: Run) -> None:
-    """Return 3, value 1, scale 4, weight 0.9: 0.130807. The entropy is rewarded, weighted, and not divided by the scale."""
+    """Return 3, value 1, scale 4, weight 0.9: 0.130807. The entropy is rewarded, weighted, and not divided by the
+    scale."""
     config = config_of(run, entropy_scale=3e-4)
     one = np.ones((1, 1))
     arguments = (run.cast(-0.291021 * one), run.cast(0.565065 * one), 3 * one, one, run.cast(0.9 * one), 4.0)
@@ -168,7 +210,8 @@ def actor_loss_matches(run: Run) -> None:
 
 
 def value_logits(run: Run, seed: int, shape: tuple[int, int], bins: int, slow: bool) -> np.ndarray:
-    """Logits of a critic; those of the slow critic have a peak somewhere, so that their mean is well determined in every precision."""
+    """Logits of a critic; those of the slow critic have a peak somewhere, so that their mean is well determined in
+    every precision."""
     rng = np.random.default_rng(seed)
     logits = rng.normal(0, 1 if slow else 3, (*shape, bins))
     if slow:
@@ -178,7 +221,8 @@ def value_logits(run: Run, seed: int, shape: tuple[int, int], bins: int, slow: b
 
 @check("BEH-12", uses=["critic_loss"], level=0)
 def critic_loss_literals(run: Run) -> None:
-    """Equal logits cost 2 ln 255 whatever the targets; the slow critic is a target as the two-hot of its mean, not as a distribution."""
+    """Equal logits cost 2 ln 255 whatever the targets; the slow critic is a target as the two-hot of its mean, not as a
+    distribution."""
     config = config_of(run, bins=255, slow_critic_scale=1.0)
     equal, returns, weight = np.zeros((1, 3, 255)), np.array([[0.0, -50, 1e12]]), np.array([[1.0, 0.5, 0]])
     run.expect("critic_loss", (equal, equal, returns, weight, config), 11.082527 * weight, bound=LITERAL["float32"])
@@ -198,7 +242,8 @@ def losses_towards_the_mean(run: Run) -> Iterator[tuple[tuple[np.ndarray, ...], 
     """Logits, slow logits and returns [1, 3], and the loss of each entry, for several shares of the slow critic."""
     slow = np.full((1, 3, 255), -1e4)
     slow[..., 127] = slow[..., 129] = 0
-    # -ln softmax is c at the bin 127, c - 8 at 128 and c - 16 at 129; return 0 lies on 127, the mean 0.185103 between 128 and 129.
+    # -ln softmax is c at the bin 127, c - 8 at 128 and c - 16 at 129; return 0 lies on 127, the mean 0.185103 between
+    # 128 and 129.
     logits = np.zeros((1, 3, 255))
     logits[..., 128], logits[..., 129] = 8, 16
     c = math.log(253 + math.exp(8) + math.exp(16))
@@ -222,7 +267,10 @@ def replay_critic_loss_matches(run: Run) -> None:
 
 def compare_critic_losses(run: Run, function: str) -> None:
     @run.for_all(
-        seed=seeds(), bins=st.sampled_from([31, 255]), slow_scale=st.sampled_from([0.5, 1.0]), flags=st.sampled_from([bool, float])
+        seed=seeds(),
+        bins=st.sampled_from([31, 255]),
+        slow_scale=st.sampled_from([0.5, 1.0]),
+        flags=st.sampled_from([bool, float]),
     )
     def _(seed: int, bins: int, slow_scale: float, flags: type) -> None:
         config = config_of(run, bins=bins, slow_critic_scale=slow_scale, critic_scale=5.0, replay_critic_scale=7.0)
@@ -239,7 +287,8 @@ def compare_critic_losses(run: Run, function: str) -> None:
 
 @check("BEH-16", "BEH-17", uses=["losses"], level=2, dtypes=WHOLE)
 def the_slow_critic_only_regularizes(run: Run) -> None:
-    """Another slow critic changes the two critic losses and nothing else, and with `slow_critic_scale` 0 not even these."""
+    """Another slow critic changes the two critic losses and nothing else, and with `slow_critic_scale` 0 not even
+    these."""
     problem = problem_of(run, "vector", "discrete")
     params, slow, *rest, config = problem.loss_arguments
     other = {name: value * 0.5 for name, value in slow.items()}
@@ -254,17 +303,32 @@ def the_slow_critic_only_regularizes(run: Run) -> None:
         run.exact(name, after["metrics"][name], value)
     alone = config_of(run, slow_critic_scale=0.0)
     losses = [run.call("losses", params, critic, *rest, alone)[1]["losses"] for critic in (slow, other)]
-    run.exact("critic losses without the regularizer", [losses[0][n] for n in losses[0]], [losses[1][n] for n in losses[0]])
+    run.exact(
+        "critic losses without the regularizer", [losses[0][n] for n in losses[0]], [losses[1][n] for n in losses[0]]
+    )
 
 
 @check("BEH-19", uses=["update_slow_critic"], level=0)
 def slow_critic_literals(run: Run) -> None:
-    """1 towards 2 with decay 0.98 is 1.02; decay 1 freezes, decay 0 copies; other parameters are ignored, arguments left alone."""
-    slow, params = {"critic/a": np.array([1.0, -1]), "critic/b": np.zeros((1, 2))}, {
-        "critic/a": np.array([2.0, -1]), "critic/b": np.full((1, 2), 50.0), "actor/a": np.zeros(3), "slow_critic": np.zeros(1),
-    }  # fmt: skip
+    """1 towards 2 with decay 0.98 is 1.02; decay 1 freezes, decay 0 copies; other parameters are ignored, arguments
+    left alone."""
+    slow, params = (
+        {"critic/a": np.array([1.0, -1]), "critic/b": np.zeros((1, 2))},
+        {
+            "critic/a": np.array([2.0, -1]),
+            "critic/b": np.full((1, 2), 50.0),
+            "actor/a": np.zeros(3),
+            "slow_critic": np.zeros(1),
+        },
+    )
     expected = {"critic/a": np.array([1.02, -1]), "critic/b": np.ones((1, 2))}
-    run.expect("update_slow_critic", (slow, params, 0.98), expected, magnitude={"critic/a": 2.0, "critic/b": 50.0}, bound=4 * run.u)
+    run.expect(
+        "update_slow_critic",
+        (slow, params, 0.98),
+        expected,
+        magnitude={"critic/a": 2.0, "critic/b": 50.0},
+        bound=4 * run.u,
+    )
     run.exact("slow after the update", slow["critic/a"], np.array([1.0, -1]))
     for decay, result in ((1.0, slow), (0.0, params)):
         updated = run.call("update_slow_critic", slow, params, decay)
@@ -279,8 +343,14 @@ def slow_critic_matches(run: Run) -> None:
     @run.for_all(seed=seeds(), decay=st.sampled_from([0.98, 0.999, 0.5]), distance=st.sampled_from([1e-3, 1.0]))
     def _(seed: int, decay: float, distance: float) -> None:
         stored = "float64" if run.dtype == "float64" else "float32"
-        slow = {name: round_to(normals(seed + n, 3, n + 1), stored) for n, name in enumerate(("critic/x/kernel", "critic/x/bias"))}
-        params = {name: round_to(value + normals(seed + 2, *value.shape, scale=distance), stored) for name, value in slow.items()}
+        slow = {
+            name: round_to(normals(seed + n, 3, n + 1), stored)
+            for n, name in enumerate(("critic/x/kernel", "critic/x/bias"))
+        }
+        params = {
+            name: round_to(value + normals(seed + 2, *value.shape, scale=distance), stored)
+            for name, value in slow.items()
+        }
         magnitude = {name: np.abs(value) + np.abs(params[name]) for name, value in slow.items()}
         expected = reference.update_slow_critic(slow, params, decay)
         run.expect("update_slow_critic", (slow, params, decay), expected, magnitude=magnitude, bound=4 * run.u)

@@ -18,14 +18,19 @@ from reference_numpy.transforms import symlog
 LITERAL = {"float64": 1e-6, "float32": 4e-6, "bfloat16": 3e-2}
 LEADING = st.sampled_from([(), (2, 3)])
 CATEGORICAL = st.sampled_from([(5,), (3, 1), (2, 3, 64)])
-LOGITS = st.one_of(st.floats(-20, 20, width=32), st.sampled_from([0.0, -0.0, 1e-45, 100.0, -1e4, 1e30, -1e30, -math.inf]))
+LOGITS = st.one_of(
+    st.floats(-20, 20, width=32), st.sampled_from([0.0, -0.0, 1e-45, 100.0, -1e4, 1e30, -1e30, -math.inf])
+)
 # Small, so that no result is near the edge of a precision, where float32 may and may not overflow.
-FINITE = st.one_of(st.floats(-1e4, 1e4, width=32), st.floats(-3, 3, width=32), st.sampled_from([0.0, -0.0, 1e-45, 1e-20, 1e9]))
+FINITE = st.one_of(
+    st.floats(-1e4, 1e4, width=32), st.floats(-3, 3, width=32), st.sampled_from([0.0, -0.0, 1e-45, 1e-20, 1e9])
+)
 LN_2 = math.log(2)
 
 
 def held(run: Run, x: Any) -> np.ndarray:
-    """A result as float32 or float64 holds it: float32 overflows where float64, which a candidate is free to use, does not."""
+    """A result as float32 or float64 holds it: float32 overflows where float64, which a candidate is free to use, does
+    not."""
     return round_to(x, "float64" if run.dtype == "float64" else "float32")
 
 
@@ -47,7 +52,8 @@ def summed_magnitude(classes: int, products: np.ndarray) -> np.ndarray:
 
 @check("DIS-5", uses=["unimix_log_probs"], level=0)
 def mixture_literals(run: Run) -> None:
-    """Logits ln 8, 0, 0 with 1 percent uniform are ln of .7953, .1023, .1023; without it a logit 1000 below has log-probability -1000."""
+    """Logits ln 8, 0, 0 with 1 percent uniform are ln of .7953, .1023, .1023; without it a logit 1000 below has
+    log-probability -1000."""
     logits = run.cast([math.log(8), 0, 0])
     mixed = np.array([-0.2289940, -2.2795198, -2.2795198])
     run.expect("unimix_log_probs", (logits, 0.01), mixed, magnitude=1.0, bound=LITERAL[run.dtype])
@@ -56,16 +62,21 @@ def mixture_literals(run: Run) -> None:
     apart = run.cast([[0.0, -1000], [1000, 0], [-1000, -2000]])
     first = np.array([0.0, -1000])
     run.expect("unimix_log_probs", (apart, 0.0), np.tile(first, (3, 1)), magnitude=1024, bound=16 * run.u)
-    run.expect("unimix_log_probs", (apart, 0.01), np.tile(np.log([0.995, 0.005]), (3, 1)), magnitude=1.0, bound=64 * run.u)
+    run.expect(
+        "unimix_log_probs", (apart, 0.01), np.tile(np.log([0.995, 0.005]), (3, 1)), magnitude=1.0, bound=64 * run.u
+    )
     smallest = run.call("unimix_log_probs", np.where(np.arange(64) == 3, 100.0, 0.0), 0.01)
     run.compare("the least of 64 classes", np.min(smallest), math.log(0.01 / 64), bound=16 * run.u)
 
 
 @check("DIS-1", "DIS-3", "DIS-5", "CON-23", uses=["unimix_log_probs"], level=0)
 def mixture_matches(run: Run) -> None:
-    """Logits of any size up to 1e30 and minus infinity, any leading axes and number of classes, any share of the mixture."""
+    """Logits of any size up to 1e30 and minus infinity, any leading axes and number of classes, any share of the
+    mixture."""
 
-    @run.for_all(logits=CATEGORICAL.flatmap(lambda shape: arrays(LOGITS, shape)), unimix=st.sampled_from([0.0, 0.01, 0.5]))
+    @run.for_all(
+        logits=CATEGORICAL.flatmap(lambda shape: arrays(LOGITS, shape)), unimix=st.sampled_from([0.0, 0.01, 0.5])
+    )
     def _(logits: np.ndarray, unimix: float) -> None:
         logits = run.cast(np.where(np.arange(logits.shape[-1]) == 0, np.maximum(logits, -1e30), logits))
         below = logits.max(-1, keepdims=True) - logits
@@ -81,9 +92,21 @@ def mixture_matches(run: Run) -> None:
 
 @check("DIS-6", uses=["unimix_log_probs"], level=0)
 def mixture_of_special_logits(run: Run) -> None:
-    """Minus infinity is probability 0; one NaN or plus infinity, or nothing but minus infinity, makes all classes NaN, in its row only."""
+    """Minus infinity is probability 0; one NaN or plus infinity, or nothing but minus infinity, makes all classes NaN,
+    in its row only."""
     inf, nan = math.inf, math.nan
-    logits = np.array([[0, -inf, 0], [nan, 0, 0], [0, inf, 0], [-inf] * 3, [inf, -inf, 0], [inf] * 3, [-inf, nan, -inf], [-inf, -inf, 7.0]])
+    logits = np.array(
+        [
+            [0, -inf, 0],
+            [nan, 0, 0],
+            [0, inf, 0],
+            [-inf] * 3,
+            [inf, -inf, 0],
+            [inf] * 3,
+            [-inf, nan, -inf],
+            [-inf, -inf, 7.0],
+        ]
+    )
     for unimix in (0.0, 0.01):
         s = np.array([[0.5, 0, 0.5]] + [[nan] * 3] * 6 + [[0, 0, 1]])
         with np.errstate(divide="ignore"):
@@ -95,7 +118,8 @@ def mixture_of_special_logits(run: Run) -> None:
 
 @check("DIS-7", uses=["observe", "kl_losses"], level=1)
 def latents_are_mixed(run: Run) -> None:
-    """With a share of 1 latents are uniform and posterior and prior agree, whatever the logits; with 1/2 the KL is that of the mixtures."""
+    """With a share of 1 latents are uniform and posterior and prior agree, whatever the logits; with 1/2 the KL is that
+    of the mixtures."""
     config, task = small_config(run.profile, run.dtype, latent_unimix=1.0, free_nats=0.0), spaces("vector", "discrete")
     rng, N, T, S, C = run.rng(), 2, 3, config.stoch, config.classes
     params = random_parameters(rng, config, task, run.dtype)
@@ -106,20 +130,35 @@ def latents_are_mixed(run: Run) -> None:
     run.exact("classes of uniform latents", np.round(states["stoch"], 3), np.eye(C)[classes])
     posterior, prior = run.cast(rng.normal(0, 5, (2, N, S, C)))
     run.compare(
-        "KL of uniform latents", run.call("kl_losses", posterior, prior, config), (np.zeros(N),) * 2, magnitude=1.0, bound=64 * run.u
+        "KL of uniform latents",
+        run.call("kl_losses", posterior, prior, config),
+        (np.zeros(N),) * 2,
+        magnitude=1.0,
+        bound=64 * run.u,
     )
     half = dataclasses.replace(config, latent_unimix=0.5)
     p, q = (np.exp(x) / np.exp(x).sum(-1, keepdims=True) / 2 + 0.5 / C for x in (posterior, prior))
     kl = (p * np.log(p / q)).sum((-1, -2))
-    run.compare("KL of the mixtures", run.call("kl_losses", posterior, prior, half), (kl, kl), magnitude=1 + kl, bound=256 * run.u)
+    run.compare(
+        "KL of the mixtures",
+        run.call("kl_losses", posterior, prior, half),
+        (kl, kl),
+        magnitude=1 + kl,
+        bound=256 * run.u,
+    )
 
 
 @check("DIS-7", uses=["reconstruction_losses", "action_entropy"], level=1)
 def the_actor_is_mixed_and_the_decoder_is_not(run: Run) -> None:
     """Discrete observations are scored without a mixture, whatever the shares; discrete actions with `actor_unimix`."""
-    config, task = small_config(run.profile, run.dtype, latent_unimix=0.5, actor_unimix=1.0), spaces("vector", "discrete")
+    config, task = (
+        small_config(run.profile, run.dtype, latent_unimix=0.5, actor_unimix=1.0),
+        spaces("vector", "discrete"),
+    )
     predictions = {"mode": np.array([[0, 0, 64.0, 8, 0]]), "position": np.zeros((1, 3))}
-    losses = run.call("reconstruction_losses", predictions, {"mode": np.array([[0, 1]]), "position": np.zeros((1, 3))}, task, config)
+    losses = run.call(
+        "reconstruction_losses", predictions, {"mode": np.array([[0, 1]]), "position": np.zeros((1, 3))}, task, config
+    )
     run.compare("mode", losses["mode"], np.array([64 + 8 + math.log1p(math.exp(-8))]), bound=64 * run.u)
     entropy = run.call("action_entropy", {"action": {"logits": np.array([[9.0, 0, 0, 0]])}}, task, config)
     run.compare("entropy of a uniform actor", entropy, np.array([math.log(4)]), bound=64 * run.u)
@@ -127,7 +166,8 @@ def the_actor_is_mixed_and_the_decoder_is_not(run: Run) -> None:
 
 @check("DIS-8", "CON-17", uses=["categorical_sample"], level=0)
 def sample_literals(run: Run) -> None:
-    """The class changes where the cumulative sum passes the uniform; probabilities are used as they are, the last sum is not needed."""
+    """The class changes where the cumulative sum passes the uniform; probabilities are used as they are, the last sum
+    is not needed."""
     log_probs = np.tile(run.cast([-0.2289940, -2.2795198, -2.2795198]), (5, 1))
     sample = run.call("categorical_sample", log_probs, run.cast([0, 0.79, 0.80, 0.90, 0.999]))
     run.exact("cumulative sums 0.795, 0.898", sample, np.eye(3)[[0, 0, 1, 2, 2]])
@@ -138,7 +178,9 @@ def sample_literals(run: Run) -> None:
     u = run.cast([0, 0.5, 1 - 2**-7])
     for place in range(4):
         certain = np.where(np.arange(4) == place, 0, -np.inf)
-        run.exact("a certain class", run.call("categorical_sample", np.tile(certain, (3, 1)), u), np.eye(4)[[place] * 3])
+        run.exact(
+            "a certain class", run.call("categorical_sample", np.tile(certain, (3, 1)), u), np.eye(4)[[place] * 3]
+        )
 
 
 @check("DIS-8", "CON-16", uses=["categorical_sample"], level=0)
@@ -160,7 +202,8 @@ def sample_matches(run: Run) -> None:
 
 @check("DIS-8", uses=["categorical_sample"], level=0)
 def sample_is_always_one_hot(run: Run) -> None:
-    """NaN, infinities, probabilities that sum to less or more than 1 and uniforms outside [0, 1) still give one 1 and zeros."""
+    """NaN, infinities, probabilities that sum to less or more than 1 and uniforms outside [0, 1) still give one 1 and
+    zeros."""
     bad = np.array([np.nan, -np.inf, np.inf, 0, -50, -1])
     log_probs = np.array([[a, b, c] for a in bad for b in bad for c in (0, np.nan, -np.inf)])
     for uniform in (0.0, 0.5, 0.99, 1.0, -0.5, np.nan):
@@ -179,7 +222,14 @@ def straight_through_is_the_sample(run: Run) -> None:
         run.exact("straight_through", run.call("straight_through", log_probs_of(run, seed, shape), sample), sample)
 
 
-@check("DIS-10", "DIS-11", "DIS-12", "CON-7", uses=["categorical_log_prob", "categorical_entropy", "categorical_kl"], level=0)
+@check(
+    "DIS-10",
+    "DIS-11",
+    "DIS-12",
+    "CON-7",
+    uses=["categorical_log_prob", "categorical_entropy", "categorical_kl"],
+    level=0,
+)
 def categorical_literals(run: Run) -> None:
     """Entropy 0.6486683 of the example, ln C when uniform; KL 0.1438410 one way, 0.1308120 the other, 0 to itself."""
     bound = LITERAL[run.dtype]
@@ -195,16 +245,27 @@ def categorical_literals(run: Run) -> None:
 
 @check("DIS-12", uses=["categorical_kl"], level=0)
 def a_negative_divergence_is_not_clipped(run: Run) -> None:
-    """Probabilities that sum to 1/2 and to 1 have a KL of -0.3465736: rounded log-probabilities do the same on a smaller scale."""
+    """Probabilities that sum to 1/2 and to 1 have a KL of -0.3465736: rounded log-probabilities do the same on a
+    smaller scale."""
     half = np.full(2, -LN_2)
     run.expect("categorical_kl", (run.cast(half - LN_2), run.cast(half)), -LN_2 / 2, bound=LITERAL[run.dtype])
 
 
-@check("DIS-3", "DIS-10", "DIS-11", "DIS-12", "DIS-13", uses=["categorical_log_prob", "categorical_entropy", "categorical_kl"], level=0)
+@check(
+    "DIS-3",
+    "DIS-10",
+    "DIS-11",
+    "DIS-12",
+    "DIS-13",
+    uses=["categorical_log_prob", "categorical_entropy", "categorical_kl"],
+    level=0,
+)
 def categorical_matches(run: Run) -> None:
     """Log-probability, entropy and KL over the last axis only, for sharp and flat distributions."""
 
-    @run.for_all(seed=seeds(), shape=CATEGORICAL, scale=st.sampled_from([0.1, 3.0, 30.0]), unimix=st.sampled_from([0.0, 0.01]))
+    @run.for_all(
+        seed=seeds(), shape=CATEGORICAL, scale=st.sampled_from([0.1, 3.0, 30.0]), unimix=st.sampled_from([0.0, 0.01])
+    )
     def _(seed: int, shape: tuple[int, ...], scale: float, unimix: float) -> None:
         p, q = (log_probs_of(run, s, shape, scale, unimix) for s in (seed, seed + 1))
         onehot = np.eye(shape[-1])[np.random.default_rng(seed).integers(0, shape[-1], shape[:-1])]
@@ -218,21 +279,35 @@ def categorical_matches(run: Run) -> None:
         run.exact("KL of equal distributions", run.call("categorical_kl", p, p), np.zeros(shape[:-1]))
 
 
-@check("DIS-4", "DIS-12", uses=["categorical_log_prob", "categorical_entropy", "categorical_kl", "symexp_twohot_loss"], level=0)
+@check(
+    "DIS-4",
+    "DIS-12",
+    uses=["categorical_log_prob", "categorical_entropy", "categorical_kl", "symexp_twohot_loss"],
+    level=0,
+)
 def zero_weights_silence(run: Run) -> None:
     """A weight of 0 silences an infinite or NaN logarithm; a class that p has and q has not makes the KL infinite."""
     inf, nan = np.inf, np.nan
     log_probs = np.array([[0.0, -inf, -inf], [-LN_2, -LN_2, -inf], [nan, nan, nan]])
-    run.compare("entropy", run.call("categorical_entropy", run.cast(log_probs)), np.array([0, LN_2, nan]), bound=LITERAL[run.dtype])
+    run.compare(
+        "entropy",
+        run.call("categorical_entropy", run.cast(log_probs)),
+        np.array([0, LN_2, nan]),
+        bound=LITERAL[run.dtype],
+    )
     chosen = run.call(
-        "categorical_log_prob", np.array([[-1.0, -inf], [-1, nan], [nan, -2], [-inf, -inf], [-inf, 0]]), np.eye(2)[[0, 0, 1, 0, 0]]
+        "categorical_log_prob",
+        np.array([[-1.0, -inf], [-1, nan], [nan, -2], [-inf, -inf], [-inf, 0]]),
+        np.eye(2)[[0, 0, 1, 0, 0]],
     )
     run.exact("log-probability", chosen, np.array([-1, -1, -2, -inf, -inf]))
     run.exact("blanked action", run.call("categorical_log_prob", np.array([-1, -inf, nan]), np.zeros(3)), 0.0)
     p = np.array([[0.0, -inf], [0, -inf], [-LN_2, -LN_2], [-inf, 0]])
     q = np.array([[0.0, -inf], [-LN_2, -LN_2], [0, -inf], [0, -inf]])
     expected = np.array([0, LN_2, inf, inf])
-    run.compare("KL", run.call("categorical_kl", run.cast(p), run.cast(q)), expected, magnitude=1.0, bound=LITERAL[run.dtype])
+    run.compare(
+        "KL", run.call("categorical_kl", run.cast(p), run.cast(q)), expected, magnitude=1.0, bound=LITERAL[run.dtype]
+    )
     logits = np.array([-inf, -inf, 0, 0, -inf])
     loss = run.call("symexp_twohot_loss", np.stack([logits] * 3), np.array([0.5, 0, 2.0]), SMALL_BINS)
     run.compare("twohot loss beside infinite logits", loss, np.array([LN_2, LN_2, inf]), bound=16 * run.u)
@@ -240,7 +315,8 @@ def zero_weights_silence(run: Run) -> None:
 
 @check("DIS-14", "DIS-15", uses=["symexp_twohot_loss", "symexp_twohot_mean"], level=0)
 def symexp_twohot_literals(run: Run) -> None:
-    """255 equal logits: loss ln 255, mean 0. Logits 0, 0, 0, 0, ln 4 over small bins: loss 1.3862944 for the target 2, mean 1.125."""
+    """255 equal logits: loss ln 255, mean 0. Logits 0, 0, 0, 0, ln 4 over small bins: loss 1.3862944 for the target 2,
+    mean 1.125."""
     for level in (0.0, 3.75, -1e4, 1e30):
         logits = run.cast(np.full((2, 255), level))
         loss = run.call("symexp_twohot_loss", logits, run.cast([300.0, -1e12]), held_bins(run))
@@ -267,10 +343,18 @@ def symexp_twohot_matches(run: Run) -> None:
         logits, target = run.cast(normals(seed, 2, 3, 255, scale=scale)), run.cast(target)
         size = (255 + 64) * (1 + np.ptp(logits, -1))
         arguments = (logits, target, bins)
-        run.expect("symexp_twohot_loss", arguments, reference.symexp_twohot_loss(*arguments), magnitude=size, bound=run.u)
+        run.expect(
+            "symexp_twohot_loss", arguments, reference.symexp_twohot_loss(*arguments), magnitude=size, bound=run.u
+        )
         probs = np.exp(reference.unimix_log_probs(logits, 0.0))
         magnitude = size * (probs * np.abs(bins)).sum(-1)
-        run.expect("symexp_twohot_mean", (logits, bins), reference.symexp_twohot_mean(logits, bins), magnitude=magnitude, bound=run.u)
+        run.expect(
+            "symexp_twohot_mean",
+            (logits, bins),
+            reference.symexp_twohot_mean(logits, bins),
+            magnitude=magnitude,
+            bound=run.u,
+        )
 
 
 @check("DIS-16", "DIS-18", uses=["bernoulli_loss", "bernoulli_mean"], level=0)
@@ -284,7 +368,9 @@ def bernoulli_literals(run: Run) -> None:
     if run.dtype != "bfloat16":
         run.compare("soft targets", np.array(soft), np.array([0.1329280, 30.030030]), bound=1e-3)
     logit, target = np.array([inf, inf, inf, -inf, -inf, -inf, nan, nan]), np.array([1, 0.5, 0, 0, 0.5, 1, 0, 1])
-    run.exact("infinite logits", run.call("bernoulli_loss", logit, target), np.array([0, inf, inf, 0, inf, inf, nan, nan]))
+    run.exact(
+        "infinite logits", run.call("bernoulli_loss", logit, target), np.array([0, inf, inf, 0, inf, inf, nan, nan])
+    )
     mean = run.call("bernoulli_mean", np.array([inf, -inf, 0.0, -0.0, nan]))
     run.exact("bernoulli_mean", mean, np.array([1, 0, 0.5, 0.5, nan]))
     run.expect("bernoulli_mean", (np.array([2.0, -2]),), np.array([0.8807971, 0.1192029]), bound=LITERAL["float32"])
@@ -295,7 +381,9 @@ def bernoulli_matches(run: Run) -> None:
     """Logits of any size, NaN and infinities included, and targets between 0 and 1."""
     shares = st.one_of(st.sampled_from([0.0, 1.0, 1 - 1 / 333, 0.5]), st.floats(0, 1, width=32))
 
-    @run.for_all(case=LEADING.flatmap(lambda shape: st.tuples(arrays(adversarial_numbers(), shape), arrays(shares, shape))))
+    @run.for_all(
+        case=LEADING.flatmap(lambda shape: st.tuples(arrays(adversarial_numbers(), shape), arrays(shares, shape)))
+    )
     def _(case: tuple[np.ndarray, np.ndarray]) -> None:
         logit, target = run.cast(case[0]), run.cast(case[1])
         expected = held(run, reference.bernoulli_loss(logit, target))
@@ -303,12 +391,17 @@ def bernoulli_matches(run: Run) -> None:
         loss = np.where(np.isfinite(expected), expected, 0)
         expect_held(run, "bernoulli_loss", (logit, target), magnitude=np.minimum(size * loss + 16, 1e300), bound=run.u)
         mean = reference.bernoulli_mean(logit)
-        run.expect("bernoulli_mean", (logit,), mean, magnitude=size * np.nan_to_num(mean) + run.tiny / run.u, bound=run.u)
+        run.expect(
+            "bernoulli_mean", (logit,), mean, magnitude=size * np.nan_to_num(mean) + run.tiny / run.u, bound=run.u
+        )
 
-    # Where softplus is not yet the identity in float64, and where a sigmoid made of tanh, or its logarithm, has lost its digits.
+    # Where softplus is not yet the identity in float64, and where a sigmoid made of tanh, or its logarithm, has lost
+    # its digits.
     logit = run.cast(np.concatenate([np.arange(-40, 41), [-200, 200]]))
     mean = reference.bernoulli_mean(logit)
-    run.expect("bernoulli_mean", (logit,), mean, magnitude=16 * (1 + np.abs(logit)) * mean + run.tiny / run.u, bound=run.u)
+    run.expect(
+        "bernoulli_mean", (logit,), mean, magnitude=16 * (1 + np.abs(logit)) * mean + run.tiny / run.u, bound=run.u
+    )
     for share in (0.0, 0.5, 1.0):
         expected = reference.bernoulli_loss(logit, np.full(logit.shape, share))
         magnitude = 16 * (1 + np.abs(logit)) * expected + 16
@@ -317,11 +410,18 @@ def bernoulli_matches(run: Run) -> None:
 
 @check("DIS-19", uses=["bounded_normal"], level=0)
 def bounded_normal_literals(run: Run) -> None:
-    """Raw 0, 0 is mean 0 and deviation 0.8927174; raw mean 0.5 is 0.4621172; the bounds are reached at the infinities."""
+    """Raw 0, 0 is mean 0 and deviation 0.8927174; raw mean 0.5 is 0.4621172; the bounds are reached at the
+    infinities."""
     raw = np.array([0.0, 0.5, np.inf, -np.inf, np.nan]), np.array([0.0, -2, np.inf, -np.inf, np.nan])
     expected = np.array([0, 0.4621172, 1, -1, np.nan]), np.array([0.8927174, 0.55, 1, 0.1, np.nan])
     run.expect("bounded_normal", (*raw, 0.1, 1.0), expected, magnitude=1.0, bound=LITERAL["float32"])
-    run.expect("bounded_normal", (*raw, 0.5, 0.5), (expected[0], np.array([0.5] * 4 + [np.nan])), magnitude=1.0, bound=LITERAL["float32"])
+    run.expect(
+        "bounded_normal",
+        (*raw, 0.5, 0.5),
+        (expected[0], np.array([0.5] * 4 + [np.nan])),
+        magnitude=1.0,
+        bound=LITERAL["float32"],
+    )
 
 
 @check("DIS-19", "DIS-25", uses=["bounded_normal"], level=0)
@@ -335,21 +435,27 @@ def bounded_normal_matches(run: Run) -> None:
     def _(raw: tuple[np.ndarray, np.ndarray], bounds: tuple[float, float]) -> None:
         arguments = (run.cast(raw[0]), run.cast(raw[1]), *bounds)
         expected = reference.bounded_normal(*arguments)
-        mean, std = run.expect("bounded_normal", arguments, expected, magnitude=(1.0, max(1.0, bounds[1])), bound=16 * run.u)
+        mean, std = run.expect(
+            "bounded_normal", arguments, expected, magnitude=(1.0, max(1.0, bounds[1])), bound=16 * run.u
+        )
         run.holds("mean in [-1, 1]", ~(np.abs(mean) > 1 + 4 * run.u))
         run.holds(
-            "deviation within its bounds", ~((np.asarray(std) < bounds[0] - 16 * run.u) | (np.asarray(std) > bounds[1] * (1 + 4 * run.u)))
+            "deviation within its bounds",
+            ~((np.asarray(std) < bounds[0] - 16 * run.u) | (np.asarray(std) > bounds[1] * (1 + 4 * run.u))),
         )
 
 
 @check("DIS-20", "DIS-21", "DIS-22", "CON-18", uses=["normal_sample", "normal_log_prob", "normal_entropy"], level=0)
 def normal_literals(run: Run) -> None:
-    """Mean 0.5, deviation 0.8, noise -1: sample -0.3, log-density -1.1957950, entropy at 1 and 0.1; far samples are not cut off."""
+    """Mean 0.5, deviation 0.8, noise -1: sample -0.3, log-density -1.1957950, entropy at 1 and 0.1; far samples are not
+    cut off."""
     bound = LITERAL[run.dtype]
     mean, std, sample = run.cast(0.5), run.cast(0.8), run.cast(-0.3)
     run.expect("normal_sample", (mean, std, -1.0), -0.3, magnitude=1.0, bound=bound)
     run.exact(
-        "a far sample", run.call("normal_sample", np.array([0.75, -1]), np.array([1.0, 0.5]), np.array([8.0, -6])), np.array([8.75, -4])
+        "a far sample",
+        run.call("normal_sample", np.array([0.75, -1]), np.array([1.0, 0.5]), np.array([8.0, -6])),
+        np.array([8.75, -4]),
     )
     run.expect("normal_log_prob", (mean, std, sample), -1.1957950, bound=bound)
     run.expect("normal_log_prob", (0.0, 1.0, 8.0), -32.9189385, bound=LITERAL["float32"])
@@ -358,21 +464,40 @@ def normal_literals(run: Run) -> None:
     expect_held(run, "normal_log_prob", (np.zeros(2), np.full(2, 0.125), run.cast([far, -far])), bound=16 * run.u)
 
 
-@check("DIS-1", "DIS-3", "DIS-20", "DIS-21", "DIS-22", "DIS-25", uses=["normal_sample", "normal_log_prob", "normal_entropy"], level=0)
+@check(
+    "DIS-1",
+    "DIS-3",
+    "DIS-20",
+    "DIS-21",
+    "DIS-22",
+    "DIS-25",
+    uses=["normal_sample", "normal_log_prob", "normal_entropy"],
+    level=0,
+)
 def normal_matches(run: Run) -> None:
     """Samples, log-densities and entropies of each element; NaN shows."""
     numbers = st.one_of(FINITE, st.sampled_from([np.nan, np.inf, -np.inf]))
     positive = st.one_of(st.floats(2**-10, 8, width=32), st.sampled_from([0.1, 1.0, 1e-6]))
-    draws = LEADING.flatmap(lambda shape: st.tuples(arrays(numbers, shape), arrays(positive, shape), arrays(numbers, shape)))
+    draws = LEADING.flatmap(
+        lambda shape: st.tuples(arrays(numbers, shape), arrays(positive, shape), arrays(numbers, shape))
+    )
 
     @run.for_all(draws=draws)
     def _(draws: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
         mean, std, x = (run.cast(draw) for draw in draws)
         with np.errstate(all="ignore"):
             size = np.nan_to_num(np.abs(mean) + std * np.abs(x), posinf=0)
-            run.expect("normal_sample", (mean, std, x), reference.normal_sample(mean, std, x), magnitude=size, bound=4 * run.u)
+            run.expect(
+                "normal_sample", (mean, std, x), reference.normal_sample(mean, std, x), magnitude=size, bound=4 * run.u
+            )
             size = np.nan_to_num(0.5 * ((np.abs(x) + np.abs(mean)) / std) ** 2, posinf=0) + np.abs(np.log(std)) + 1
-            run.expect("normal_log_prob", (mean, std, x), reference.normal_log_prob(mean, std, x), magnitude=size, bound=16 * run.u)
+            run.expect(
+                "normal_log_prob",
+                (mean, std, x),
+                reference.normal_log_prob(mean, std, x),
+                magnitude=size,
+                bound=16 * run.u,
+            )
         entropy = reference.normal_entropy(std)
         run.expect("normal_entropy", (std,), entropy, magnitude=np.abs(np.log(std)) + 1.5, bound=16 * run.u)
 
@@ -383,8 +508,12 @@ def normal_matches(run: Run) -> None:
 def squared_error_literals(run: Run) -> None:
     """(1 - 4) squared is 9; prediction 1, target 3, scale 1/2 is 0.0746117; a tiny error counts, with its square."""
     run.exact("mse_loss", run.call("mse_loss", np.array([1.0, 4, 2]), np.array([4.0, 1, 2])), np.array([9.0, 9, 0]))
-    run.expect("symlog_mse_loss", (np.array([1.0]), np.array([3.0]), 0.5), np.array([0.0746117]), bound=LITERAL["float32"])
-    run.expect("symlog_mse_loss", (np.array([-1.0]), np.array([-3.0]), 1.0), np.array([0.1492234]), bound=LITERAL["float32"])
+    run.expect(
+        "symlog_mse_loss", (np.array([1.0]), np.array([3.0]), 0.5), np.array([0.0746117]), bound=LITERAL["float32"]
+    )
+    run.expect(
+        "symlog_mse_loss", (np.array([-1.0]), np.array([-3.0]), 1.0), np.array([0.1492234]), bound=LITERAL["float32"]
+    )
     tiny = run.cast([1e-5, -1e-3])
     run.expect("symlog_mse_loss", (tiny, np.zeros(2), 0.5), 0.5 * tiny**2, bound=16 * run.u)
 
@@ -409,7 +538,8 @@ NORMALS = ("normal_sample", "normal_log_prob")
 
 @check(
     "DIS-3", "CON-8", level=0,
-    uses=["categorical_sample", "symexp_twohot_loss", "symexp_twohot_mean", "bounded_normal", "symlog_mse_loss", *PAIRS, *NORMALS],
+    uses=["categorical_sample", "symexp_twohot_loss", "symexp_twohot_mean", "bounded_normal", "symlog_mse_loss",
+          *PAIRS, *NORMALS],
 )  # fmt: skip
 def shapes_that_differ_are_refused(run: Run) -> None:
     """Arguments whose shapes differ are refused, also where they could be broadcast."""

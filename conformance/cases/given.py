@@ -1,6 +1,7 @@
 """Checks of implementations that take samples in place of noise: the functions named `..._given`.
 
-The samples are those that the reference draws from noise, so that what is expected is what the reference computes from that noise.
+The samples are those that the reference draws from noise, so that what is expected is what the reference computes from
+that noise.
 """
 
 from typing import Any
@@ -38,7 +39,11 @@ def observe_given_matches(run: Run) -> None:
         arguments = observe_arguments(run, seed, config)
         params, *inputs, _, _ = arguments
         states = rssm.observe(*arguments)
-        expected = {"deter": states["deter"], "posterior": states["logits"], "prior": rssm.prior(params, states["deter"], config)}
+        expected = {
+            "deter": states["deter"],
+            "posterior": states["logits"],
+            "prior": rssm.prior(params, states["deter"], config),
+        }
         run.expect("observe_given", (params, *inputs, states["stoch"], config), expected, magnitude="tensor")
 
 
@@ -52,7 +57,9 @@ def imagine_given_matches(run: Run) -> None:
         params, carry, action, *rest = imagine_arguments(run, seed, config)
         states = reference_imagine(params, carry, action, *rest)
         expected = {"deter": states["deter"], "prior": rssm.prior(params, states["deter"][:, 1:], config)}
-        run.expect("imagine_given", (params, carry, action, states["stoch"][:, 1:], config), expected, magnitude="tensor")
+        run.expect(
+            "imagine_given", (params, carry, action, states["stoch"][:, 1:], config), expected, magnitude="tensor"
+        )
 
 
 @check(*LOSS_REQUIREMENTS, uses=["losses_given"], level=2, dtypes=WHOLE)
@@ -65,7 +72,9 @@ def losses_given_match(run: Run) -> None:
         where, bound = f"{observation}, {action}: ", bound_of(run, 1e-9, 2e-4)
         run.compare(where + "losses", actual["losses"], aux["losses"], magnitude=loss_magnitude(aux), bound=bound)
         run.compare(where + "total", actual_total, total, magnitude=abs(total), bound=bound)
-        run.compare(where + "return_range", tuple(actual["return_range"]), aux["return_range"], magnitude=1.0, bound=bound)
+        run.compare(
+            where + "return_range", tuple(actual["return_range"]), aux["return_range"], magnitude=1.0, bound=bound
+        )
 
 
 @check(*GRADIENT_REQUIREMENTS, uses=["gradients_given"], level=2, dtypes=WHOLE)
@@ -74,24 +83,40 @@ def gradients_given_match(run: Run) -> None:
     for observation, action in (("vector", "discrete"), ("both", "mixed")):
         problem = problem_of(run, observation, action)
         derivatives = reference_derivatives(run.seed, run.profile, observation, action, run.dtype)
-        total = sum(getattr(problem.config, f"{name.split('/')[0]}_scale") * value for name, value in derivatives.items())
+        total = sum(
+            getattr(problem.config, f"{name.split('/')[0]}_scale") * value for name, value in derivatives.items()
+        )
         gradients = run.call("gradients_given", *given_arguments(problem))
         directions = unit_directions(problem, run.seed).values()
         products = [
-            sum(float((np.asarray(gradients[name]) * along).sum()) for name, along in direction.items()) for direction in directions
+            sum(float((np.asarray(gradients[name]) * along).sum()) for name, along in direction.items())
+            for direction in directions
         ]
         where = f"{observation}, {action}: gradient along directions"
         run.compare(where, np.array(products), total, magnitude=np.abs(total).max(), bound=bound_of(run, 1e-6, 5e-3))
 
 
-@check("AGT-29", "AGT-30", "BEH-21", "OPT-17", "OPT-21", uses=["train_step_given", "gradients_given"], level=3, dtypes=WHOLE)
+@check(
+    "AGT-29",
+    "AGT-30",
+    "BEH-21",
+    "OPT-17",
+    "OPT-21",
+    uses=["train_step_given", "gradients_given"],
+    level=3,
+    dtypes=WHOLE,
+)
 def train_step_given_matches(run: Run) -> None:
     """Parameters, moments, slow critic and return range after one step with given samples."""
     for observation, action in (("vector", "discrete"), ("both", "mixed")):
         problem = problem_of(run, observation, action)
         gradients = run.call("gradients_given", *given_arguments(problem))
-        expected = agent.train_step(problem.state, problem.batch, problem.noise, gradients, problem.spaces, problem.config)
-        actual = run.call("train_step_given", problem.state, problem.batch, samples_of(problem), problem.spaces, problem.config)
+        expected = agent.train_step(
+            problem.state, problem.batch, problem.noise, gradients, problem.spaces, problem.config
+        )
+        actual = run.call(
+            "train_step_given", problem.state, problem.batch, samples_of(problem), problem.spaces, problem.config
+        )
         compare_steps(run, f"{observation}, {action}: ", actual, expected, problem.state, bound_of(run, 1e-9, 2e-3))
 
 

@@ -1,4 +1,5 @@
-"""Gradients of single functions, seen through the losses: where infinities, ties and norms make automatic differentiation go wrong."""
+"""Gradients of single functions, seen through the losses: where infinities, ties and norms make automatic
+differentiation go wrong."""
 
 import dataclasses
 import functools
@@ -18,10 +19,13 @@ MASKED = ("rssm/posterior/out/bias", "rssm/prior/out/bias", "actor/out/buttons/l
 
 @functools.lru_cache(maxsize=8)
 def masked_problem(seed: int, profile: str, dtype: str) -> Problem:
-    """No mixtures; one class of the first latent and one of an action have probability 0. No sample lies near a boundary."""
+    """No mixtures; one class of the first latent and one of an action have probability 0. No sample lies near a
+    boundary."""
 
     def draw(attempt: int) -> Problem:
-        problem = make_problem(1000 * seed + attempt, profile, "vector", "mixed", dtype, latent_unimix=0.0, actor_unimix=0.0, free_nats=0.0)
+        problem = make_problem(
+            1000 * seed + attempt, profile, "vector", "mixed", dtype, latent_unimix=0.0, actor_unimix=0.0, free_nats=0.0
+        )
         for name in MASKED:
             problem.state["params"][name][1] = -np.inf
         return problem
@@ -31,7 +35,7 @@ def masked_problem(seed: int, profile: str, dtype: str) -> Problem:
 
 @check(
     "DIS-2", "DIS-4", "DIS-9", "DIS-12", "DIS-14", "DIS-21", "BEH-7", uses=["loss_derivatives"], level=2, dtypes=WHOLE
-)  # fmt: skip
+)
 def impossible_classes_have_finite_gradients(run: Run) -> None:
     """Every loss has its finite derivative where a latent and an action have classes of probability 0."""
     problem = masked_problem(run.seed, run.profile, run.dtype)
@@ -47,12 +51,15 @@ def impossible_classes_have_finite_gradients(run: Run) -> None:
     actual = run.call("loss_derivatives", *problem.loss_arguments, directions)
     for name, derivatives in zip(names, expected, strict=True):
         magnitude = np.abs(derivatives).max() + 1e-3
-        run.compare(f"derivative of {name}", actual[name], derivatives, magnitude=magnitude, bound=bound_of(run, 1e-6, 5e-3))
+        run.compare(
+            f"derivative of {name}", actual[name], derivatives, magnitude=magnitude, bound=bound_of(run, 1e-6, 5e-3)
+        )
 
 
 @check("DIS-14", "DIS-17", uses=["loss_derivatives"], level=2, dtypes=WHOLE)
 def constant_outputs_have_the_gradients_of_the_chapter(run: Run) -> None:
-    """The derivative of the continue loss is sigmoid - target at the logits 0, 800 and -800; that of the reward loss softmax - two-hot."""
+    """The derivative of the continue loss is sigmoid - target at the logits 0, 800 and -800; that of the reward loss
+    softmax - two-hot."""
     problem = make_problem(run.seed, run.profile, "vector", "discrete", run.dtype)
     config, along = problem.config, run.rng().normal(size=problem.config.bins)
     directions = [{"continue/out/bias": np.ones(1)}, {"reward/out/bias": along}]
@@ -64,8 +71,17 @@ def constant_outputs_have_the_gradients_of_the_chapter(run: Run) -> None:
             params[name] = np.zeros_like(params[name])
         params["continue/out/bias"] = np.array([logit])
         actual = run.call("loss_derivatives", params, *problem.loss_arguments[1:], directions)
-        for name, expected in (("continue", [probability - target, 0]), ("reward", [0, (1 / config.bins - weights) @ along])):
-            run.compare(f"derivative of {name}", actual[name], np.array(expected), magnitude=1.0, bound=bound_of(run, 1e-6, 1e-5))
+        for name, expected in (
+            ("continue", [probability - target, 0]),
+            ("reward", [0, (1 / config.bins - weights) @ along]),
+        ):
+            run.compare(
+                f"derivative of {name}",
+                actual[name],
+                np.array(expected),
+                magnitude=1.0,
+                bound=bound_of(run, 1e-6, 1e-5),
+            )
 
 
 @functools.lru_cache(maxsize=8)
@@ -80,7 +96,8 @@ def problem_without_epsilon(seed: int, profile: str, dtype: str) -> Problem:
 
 @check("LAY-4", "LAY-8", uses=["loss_derivatives"], level=2, dtypes=WHOLE)
 def normalized_layers_have_no_gradient_along_themselves(run: Run) -> None:
-    """A norm undoes longer kernels and biases, so no loss changes along them: the gradient passes through the mean square too."""
+    """A norm undoes longer kernels and biases, so no loss changes along them: the gradient passes through the mean
+    square too."""
     problem = problem_without_epsilon(run.seed, run.profile, run.dtype)
     params = problem.state["params"]
     layers = [name.removesuffix("/scale") for name in params if name.endswith("/scale") and "stem" not in name]
@@ -94,13 +111,21 @@ def normalized_layers_have_no_gradient_along_themselves(run: Run) -> None:
 
 @check("LAY-12", uses=["gradients"], level=2, dtypes=WHOLE)
 def the_first_of_equal_pixels_has_the_gradient(run: Run) -> None:
-    """Where the four pixels of every window are equal, the gradient is the one that holds nearby, where the first is a little larger.
+    """Where the four pixels of every window are equal, the gradient is the one that holds nearby, where the first is a
+    little larger.
 
-    The image repeats a 2x2 pattern and the first layer sees only its middle tap, so its output is the same at every window, and the
-    gradient of that tap is the pixel that was chosen, times what comes from above.
+    The image repeats a 2x2 pattern and the first layer sees only its middle tap, so its output is the same at every
+    window, and the gradient of that tap is the pixel that was chosen, times what comes from above.
     """
     problem = make_problem(
-        run.seed, run.profile, "image", "discrete", run.dtype, cnn_sampling="pooled", cnn_outer=False, cnn_multipliers=(1, 2, 4)
+        run.seed,
+        run.profile,
+        "image",
+        "discrete",
+        run.dtype,
+        cnn_sampling="pooled",
+        cnn_outer=False,
+        cnn_multipliers=(1, 2, 4),
     )
     pattern = np.array([[240, 30], [100, 5]], np.uint8)
     batch = {**problem.batch, "image": np.tile(pattern[..., None], (*problem.batch["reward"].shape, 8, 16, 3))}

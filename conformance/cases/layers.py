@@ -23,7 +23,8 @@ LARGEST = 2.273694468677113
 
 
 def expect_sums(run: Run, function: str, arguments: tuple[Any, ...], terms: int, *, roundings: int = 2) -> None:
-    """Compares a layer that sums `terms` products and a bias, [LAY-1]. In bfloat16 its result and that of its products may be rounded."""
+    """Compares a layer that sums `terms` products and a bias, [LAY-1]. In bfloat16 its result and that of its products
+    may be rounded."""
     x, kernel, bias, *rest = arguments
     layer = getattr(reference, function)
     magnitude = layer(np.abs(x), np.abs(kernel), np.abs(bias), *rest)
@@ -55,12 +56,18 @@ NO_BIAS = np.zeros(1)
 def linear_literals(run: Run) -> None:
     """[1, 2] gives [9.5, 12, 14.5]; with two blocks [1, 2, 3, 4] gives [21, 4301]; one block is a linear layer."""
     kernel = np.array([[1.0, 2, 3], [4, 5, 6]])
-    run.exact("linear", run.call("linear", np.array([1.0, 2]), kernel, np.array([0.5, 0, -0.5])), np.array([9.5, 12, 14.5]))
+    run.exact(
+        "linear", run.call("linear", np.array([1.0, 2]), kernel, np.array([0.5, 0, -0.5])), np.array([9.5, 12, 14.5])
+    )
     x, blocks = np.array([1.0, 2, 3, 4]), np.array([[[1.0], [10]], [[100], [1000]]])
     run.expect("block_linear", (x, blocks, np.array([0.0, 1])), np.array([21.0, 4301]), bound=LITERAL[run.dtype])
     blocks = np.array([[[1.0, 2], [0, 0]], [[0, 0], [3, 4]]])
     run.exact("positions", run.call("block_linear", x, blocks, np.array([1.0, 0, 0, 2])), np.array([2.0, 2, 12, 18]))
-    run.exact("one block", run.call("block_linear", np.array([1.0, 2]), kernel[None], np.array([0.5, 0, -0.5])), np.array([9.5, 12, 14.5]))
+    run.exact(
+        "one block",
+        run.call("block_linear", np.array([1.0, 2]), kernel[None], np.array([0.5, 0, -0.5])),
+        np.array([9.5, 12, 14.5]),
+    )
 
 
 @check("LAY-1", "LAY-2", "LAY-3", "LAY-16", "CON-30", uses=["linear", "block_linear"], level=0)
@@ -92,7 +99,8 @@ def long_sums_are_accurate(run: Run) -> None:
 
 @check("LAY-1", "LAY-4", "CON-22", uses=[*SUMS, "rms_norm", "silu", "dense"], level=0, dtypes=("bfloat16",))
 def results_have_the_compute_dtype(run: Run) -> None:
-    """Float32 parameters beside bfloat16 inputs are rounded to bfloat16, and so is the result; who computes in float64 is let off."""
+    """Float32 parameters beside bfloat16 inputs are rounded to bfloat16, and so is the result; who computes in float64
+    is let off."""
     rng = run.rng()
     kernel, bias, scale = (round_to(rng.normal(size=shape), "float32") for shape in ((5, 5, 2, 3), (3,), (3,)))
     x = run.cast(rng.normal(size=(4, 6, 2)))
@@ -118,11 +126,14 @@ def results_have_the_compute_dtype(run: Run) -> None:
 
 @check("LAY-4", uses=["rms_norm"], level=0)
 def rms_norm_literals(run: Run) -> None:
-    """[3, 4] becomes [.8485247, 1.1313663]; epsilon rules tiny rows; zeros stay zero; no mean is taken off; a NaN spoils its row only."""
+    """[3, 4] becomes [.8485247, 1.1313663]; epsilon rules tiny rows; zeros stay zero; no mean is taken off; a NaN
+    spoils its row only."""
     rounding = LITERAL[run.dtype]
     scale = np.array([1.0, 1])
     run.expect("rms_norm", (np.array([3.0, 4]), scale, 1e-4), np.array([0.8485247, 1.1313663]), bound=rounding)
-    run.expect("rms_norm", (np.array([3.0, 4]), np.array([2.0, -0.5]), 1e-4), np.array([1.6970494, -0.5656832]), bound=rounding)
+    run.expect(
+        "rms_norm", (np.array([3.0, 4]), np.array([2.0, -0.5]), 1e-4), np.array([1.6970494, -0.5656832]), bound=rounding
+    )
     tiny = np.full(2, 1e-5)
     run.expect("rms_norm", (tiny, scale, 1e-4), np.full(2, 9.999995e-4), bound=2 * rounding)
     run.exact("zeros", run.call("rms_norm", np.zeros((2, 3)), np.ones(3), 1e-4), np.zeros((2, 3)))
@@ -135,9 +146,12 @@ def rms_norm_literals(run: Run) -> None:
 
 @check("LAY-1", "LAY-4", "LAY-16", uses=["rms_norm"], level=0)
 def rms_norm_matches(run: Run) -> None:
-    """Rows of several magnitudes and any leading axes, each on its own, images too; in bfloat16 the scale and the result are rounded."""
+    """Rows of several magnitudes and any leading axes, each on its own, images too; in bfloat16 the scale and the
+    result are rounded."""
 
-    @run.for_all(seed=seeds(), leading=LEADING, n=st.sampled_from([5, 64]), scale=st.sampled_from([1e-4, 1e-2, 1.0, 1e4]))
+    @run.for_all(
+        seed=seeds(), leading=LEADING, n=st.sampled_from([5, 64]), scale=st.sampled_from([1e-4, 1e-2, 1.0, 1e4])
+    )
     def _(seed: int, leading: tuple[int, ...], n: int, scale: float) -> None:
         rng = np.random.default_rng(seed)
         x = run.cast(rng.normal(0.5, 1, (*leading, n)) * scale * 10 ** rng.uniform(-1, 1, (*leading, 1)))
@@ -146,7 +160,9 @@ def rms_norm_matches(run: Run) -> None:
         actual = run.call("rms_norm", x, weight, 1e-4)
         double = is_double(actual, reference.rms_norm(x, weight, 1e-4))
         bound = 0.51 * EPSILON["bfloat16"] if run.dtype == "bfloat16" else (n + 16) * run.u
-        run.compare("rms_norm", actual, reference.rms_norm(x, weight if double else run.cast(weight), 1e-4), bound=bound)
+        run.compare(
+            "rms_norm", actual, reference.rms_norm(x, weight if double else run.cast(weight), 1e-4), bound=bound
+        )
 
 
 @check("LAY-5", uses=["silu"], level=0)
@@ -166,7 +182,9 @@ def silu_literals(run: Run) -> None:
 def silu_matches(run: Run) -> None:
     """Any numbers, any shape; small negative results keep their relative precision."""
 
-    @run.for_all(x=LEADING.flatmap(lambda shape: arrays(st.one_of(adversarial_numbers(), st.floats(-120, 20, width=32)), shape)))
+    @run.for_all(
+        x=LEADING.flatmap(lambda shape: arrays(st.one_of(adversarial_numbers(), st.floats(-120, 20, width=32)), shape))
+    )
     def _(x: np.ndarray) -> None:
         x = run.cast(x)
         expected = reference.silu(x)
@@ -180,29 +198,50 @@ def silu_matches(run: Run) -> None:
 
 @check("LAY-6", uses=["convolution"], level=0)
 def convolution_literals(run: Run) -> None:
-    """Padding 2 and 2 at stride 1, 1 and 2 at stride 2; taps are not flipped, rows and columns not exchanged; the bias comes once."""
+    """Padding 2 and 2 at stride 1, 1 and 2 at stride 2; taps are not flipped, rows and columns not exchanged; the bias
+    comes once."""
     ones = np.ones((4, 4, 1))
     taps = np.array([3.0, 4, 4, 3])
     run.exact("stride 1", run.call("convolution", ones, ONES, NO_BIAS, 1)[..., 0], np.outer(taps, taps))
     taps = np.array([4.0, 3])
     run.exact("stride 2", run.call("convolution", ones, ONES, NO_BIAS, 2)[..., 0], np.outer(taps, taps))
     run.exact("bias", run.call("convolution", ones, 0 * ONES, np.array([2.5]), 2)[..., 0], np.full((2, 2), 2.5))
-    seen = {(0, 0): [[0, 0], [0, 11]], (1, 1): [[0, 2], [20, 22]], (4, 4): [[33, 0], [0, 0]], (1, 2): [[1, 3], [21, 23]]}
+    seen = {
+        (0, 0): [[0, 0], [0, 11]],
+        (1, 1): [[0, 2], [20, 22]],
+        (4, 4): [[33, 0], [0, 0]],
+        (1, 2): [[1, 3], [21, 23]],
+    }
     for tap, image in seen.items():
-        run.exact(f"tap {tap} at stride 2", run.call("convolution", pixels(4, 4), one_tap(*tap), NO_BIAS, 2)[..., 0], np.array(image))
+        run.exact(
+            f"tap {tap} at stride 2",
+            run.call("convolution", pixels(4, 4), one_tap(*tap), NO_BIAS, 2)[..., 0],
+            np.array(image),
+        )
     expected = np.pad(pixels(4, 6)[:, 1:, 0], ((1, 0), (0, 1)))[:4]
-    run.exact("tap (1, 3) at stride 1", run.call("convolution", pixels(4, 6), one_tap(1, 3), NO_BIAS, 1)[..., 0], expected)
+    run.exact(
+        "tap (1, 3) at stride 1", run.call("convolution", pixels(4, 6), one_tap(1, 3), NO_BIAS, 1)[..., 0], expected
+    )
 
 
 @check("LAY-7", uses=["transposed_convolution"], level=0)
 def transposed_convolution_literals(run: Run) -> None:
-    """A pixel of 1 shows taps 1 and 2, not flipped; ones count the taps 1, 2, 2, 2; the bias comes once to every output."""
+    """A pixel of 1 shows taps 1 and 2, not flipped; ones count the taps 1, 2, 2, 2; the bias comes once to every
+    output."""
     kernel = (10.0 * np.arange(5)[:, None] + np.arange(5))[..., None, None]
     one = np.ones((1, 1, 1))
-    run.exact("one pixel", run.call("transposed_convolution", one, kernel, NO_BIAS)[..., 0], np.array([[11, 12], [21, 22]]))
+    run.exact(
+        "one pixel", run.call("transposed_convolution", one, kernel, NO_BIAS)[..., 0], np.array([[11, 12], [21, 22]])
+    )
     taps = np.array([1.0, 2, 2, 2])
-    run.exact("ones", run.call("transposed_convolution", np.ones((2, 2, 1)), ONES, NO_BIAS)[..., 0], np.outer(taps, taps))
-    run.exact("bias", run.call("transposed_convolution", np.ones((2, 3, 1)), 0 * ONES, np.array([2.5]))[..., 0], np.full((4, 6), 2.5))
+    run.exact(
+        "ones", run.call("transposed_convolution", np.ones((2, 2, 1)), ONES, NO_BIAS)[..., 0], np.outer(taps, taps)
+    )
+    run.exact(
+        "bias",
+        run.call("transposed_convolution", np.ones((2, 3, 1)), 0 * ONES, np.array([2.5]))[..., 0],
+        np.full((4, 6), 2.5),
+    )
     corner = np.zeros((4, 4))
     corner[3, 1] = 1  # from the pixel (2, 0), as 2 * 2 - 1 and 2 * 0 + 1
     pixel = np.zeros((3, 2, 1))
@@ -229,21 +268,31 @@ def transposed_convolution_is_the_adjoint(run: Run) -> None:
 
     @run.for_all(seed=seeds())
     def _(seed: int) -> None:
-        y, x, kernel = run.cast(normals(seed, 6, 8, 3)), run.cast(normals(seed + 1, 3, 4, 2)), run.cast(normals(seed + 2, 5, 5, 3, 2))
+        y, x, kernel = (
+            run.cast(normals(seed, 6, 8, 3)),
+            run.cast(normals(seed + 1, 3, 4, 2)),
+            run.cast(normals(seed + 2, 5, 5, 3, 2)),
+        )
         down = np.asarray(run.call("convolution", y, kernel, np.zeros(2), 2), np.float64) * x
-        up = np.asarray(run.call("transposed_convolution", x, kernel.swapaxes(2, 3).copy(), np.zeros(3)), np.float64) * y
+        up = (
+            np.asarray(run.call("transposed_convolution", x, kernel.swapaxes(2, 3).copy(), np.zeros(3)), np.float64) * y
+        )
         run.compare("inner products", up.sum(), down.sum(), magnitude=np.abs(down).sum() + np.abs(up).sum())
 
 
 @check("LAY-8", uses=["dense", "mlp"], level=0)
 def dense_literals(run: Run) -> None:
-    """Linear, then norm, then SiLU: [3, 4] through an identity becomes silu of [.8485247, 1.1313663]; a missing parameter is named."""
+    """Linear, then norm, then SiLU: [3, 4] through an identity becomes silu of [.8485247, 1.1313663]; a missing
+    parameter is named."""
     params = {"a/hidden0/kernel": np.eye(2), "a/hidden0/bias": np.zeros(2), "a/hidden0/scale": np.ones(2)}
     bound = 2 * LITERAL[run.dtype]
     expected = np.array([0.5941859, 0.8554159])
     run.expect("dense", (params, "a/hidden0", np.array([3.0, 4]), 1e-4), expected, bound=bound)
     run.expect("mlp", (params, "a", np.array([3.0, 4]), 1, 1e-4), expected, bound=bound)
-    for function, arguments in (("dense", (params, "a/hidden1", np.ones(2), 1e-4)), ("mlp", (params, "a", np.ones(2), 2, 1e-4))):
+    for function, arguments in (
+        ("dense", (params, "a/hidden1", np.ones(2), 1e-4)),
+        ("mlp", (params, "a", np.ones(2), 2, 1e-4)),
+    ):
         try:
             run.call(function, *arguments)
         except KeyError as error:
@@ -254,7 +303,8 @@ def dense_literals(run: Run) -> None:
 
 @check("LAY-8", "LAY-16", uses=["dense", "mlp"], level=0)
 def mlp_matches(run: Run) -> None:
-    """One to three layers with biases, scales and sizes that differ, in their order, with any leading axes and epsilon."""
+    """One to three layers with biases, scales and sizes that differ, in their order, with any leading axes and
+    epsilon."""
 
     @run.for_all(seed=seeds(), leading=LEADING, layers=st.sampled_from([1, 3]), epsilon=st.sampled_from([1e-4, 0.5]))
     def _(seed: int, leading: tuple[int, ...], layers: int, epsilon: float) -> None:
@@ -262,7 +312,10 @@ def mlp_matches(run: Run) -> None:
         for layer, (inputs, outputs) in enumerate(((5, 7), (7, 6), (6, 4))):
             name = f"net/hidden{layer}"
             params[f"{name}/kernel"] = run.cast(rng.normal(size=(inputs, outputs)))
-            params[f"{name}/bias"], params[f"{name}/scale"] = run.cast(rng.normal(size=outputs)), run.cast(rng.normal(1, 0.5, outputs))
+            params[f"{name}/bias"], params[f"{name}/scale"] = (
+                run.cast(rng.normal(size=outputs)),
+                run.cast(rng.normal(1, 0.5, outputs)),
+            )
         x = run.cast(rng.normal(size=(*leading, 5)) * 3)
         expected = reference.mlp(params, "net", x, layers, epsilon)
         run.expect("mlp", (params, "net", x, layers, epsilon), expected, magnitude="tensor", factor=4)
@@ -272,13 +325,16 @@ def mlp_matches(run: Run) -> None:
 
 @check("LAY-9", "LAY-11", uses=["truncated_normal"], level=0)
 def truncated_normal_literals(run: Run) -> None:
-    """The quantiles 0, 1/4, 1/2, 3/4 and 0.9; fan 1024 divides by 32; scale 0 gives exact zeros; scalars stay scalars."""
+    """The quantiles 0, 1/4, 1/2, 3/4 and 0.9; fan 1024 divides by 32; scale 0 gives exact zeros; scalars stay
+    scalars."""
     bound = 2e-7 if run.dtype == "float64" else 1.2e-5
     quantiles = np.array([-2.2736945, -0.7265726, 0, 0.7265726, 1.3460640])
     uniform = np.array([0, 0.25, 0.5, 0.75, round_to(0.9, "float32")])
     run.expect("truncated_normal", (uniform, 1, 1.0), quantiles, magnitude=1.0, bound=bound)
     run.expect("truncated_normal", (uniform[4], 1024, 1.0), 0.0420645, magnitude=1 / 32, bound=4e-6 + bound)
-    run.expect("truncated_normal", (uniform[:, None], 4, 0.01), 0.005 * quantiles[:, None], magnitude=0.005, bound=bound)
+    run.expect(
+        "truncated_normal", (uniform[:, None], 4, 0.01), 0.005 * quantiles[:, None], magnitude=0.005, bound=bound
+    )
     run.exact("scale 0", run.call("truncated_normal", uniform, 7, 0.0), np.zeros(5))
 
 
@@ -288,7 +344,13 @@ def truncated_normal_matches(run: Run) -> None:
     error = 1e-10 if run.dtype == "float64" else 1e-5
     grid = (np.arange(4096) + 0.5) / 4096
     weights = np.asarray(
-        run.expect("truncated_normal", (grid, 1, 1.0), reference.truncated_normal(grid, 1, 1.0), magnitude=1.0, bound=1.14 * error)
+        run.expect(
+            "truncated_normal",
+            (grid, 1, 1.0),
+            reference.truncated_normal(grid, 1, 1.0),
+            magnitude=1.0,
+            bound=1.14 * error,
+        )
     )
     run.compare("standard deviation", np.std(weights), 1.0, bound=1e-3)
     run.holds("increasing", np.diff(weights) > 0)
@@ -310,17 +372,29 @@ def truncated_normal_matches(run: Run) -> None:
 
 @check("LAY-9", "LAY-10", uses=["initial_parameters"], level=1)
 def fans_are_those_of_whole_layers(run: Run) -> None:
-    """With every uniform at 0.9, each kernel is 1.3460640 times its scale over the root of its fan: all blocks, all 25 taps together."""
-    task, config = spaces(), small_config(run.profile, run.dtype, actor_outscale=0.01, reward_outscale=0.0, critic_outscale=0.0)
+    """With every uniform at 0.9, each kernel is 1.3460640 times its scale over the root of its fan: all blocks, all 25
+    taps together."""
+    task, config = (
+        spaces(),
+        small_config(run.profile, run.dtype, actor_outscale=0.01, reward_outscale=0.0, critic_outscale=0.0),
+    )
     table = parameter_table(config, task)
-    uniform = {name: np.full(entry.shape, 0.9) for name, entry in table.items() if entry.initializer == "truncated_normal"}
+    uniform = {
+        name: np.full(entry.shape, 0.9) for name, entry in table.items() if entry.initializer == "truncated_normal"
+    }
     params = run.call("initial_parameters", table, uniform)
     for name, entry in table.items():
         *others, part = name.split("/")
         if part == "kernel":
             axes = entry.shape
             fan = {2: axes[0], 3: axes[0] * axes[1], 4: 25 * axes[-2]}[len(axes)]
-            scale = 0.01 if name.startswith("actor/out/") else 0.0 if "/".join(others) in ("reward/out", "critic/out") else 1.0
+            scale = (
+                0.01
+                if name.startswith("actor/out/")
+                else 0.0
+                if "/".join(others) in ("reward/out", "critic/out")
+                else 1.0
+            )
             expected = np.full(axes, 1.3460640 * scale / np.sqrt(fan))
             run.compare(name, params[name], expected, magnitude=1 / np.sqrt(fan), bound=2e-5)
         else:
@@ -329,9 +403,12 @@ def fans_are_those_of_whole_layers(run: Run) -> None:
 
 @check("LAY-12", "LAY-13", uses=["max_pool", "upsample"], level=0)
 def pooling_literals(run: Run) -> None:
-    """[[1, 2], [3, 4]] pools to 4 and [[1, 2]] grows to [[1, 1, 2, 2], [1, 1, 2, 2]]; a NaN anywhere in a window shows."""
+    """[[1, 2], [3, 4]] pools to 4 and [[1, 2]] grows to [[1, 1, 2, 2], [1, 1, 2, 2]]; a NaN anywhere in a window
+    shows."""
     run.exact("max_pool", run.call("max_pool", np.array([[[1.0], [2]], [[3], [4]]])), np.array([[[4]]]))
-    run.exact("upsample", run.call("upsample", np.array([[[1.0], [2]]]))[..., 0], np.array([[1, 1, 2, 2], [1, 1, 2, 2]]))
+    run.exact(
+        "upsample", run.call("upsample", np.array([[[1.0], [2]]]))[..., 0], np.array([[1, 1, 2, 2], [1, 1, 2, 2]])
+    )
     run.exact("negative numbers", run.call("max_pool", np.full((2, 2, 1), -3.0)), np.full((1, 1, 1), -3.0))
     for row in range(2):
         for column in range(2):
@@ -369,7 +446,9 @@ def other_image_stages_match(run: Run) -> None:
 def compare_image_stages(run: Run, kinds: Iterable[tuple[str, bool]]) -> None:
     task, rng = Spaces({"image": Image(8, 4, 2)}, {"action": Vector(1)}), run.rng()
     for sampling, outer in kinds:
-        config = small_config(run.profile, run.dtype, cnn_sampling=sampling, cnn_outer=outer, cnn_multipliers=(1, 4), blocks=4)
+        config = small_config(
+            run.profile, run.dtype, cnn_sampling=sampling, cnn_outer=outer, cnn_multipliers=(1, 4), blocks=4
+        )
         params = {name: run.cast(value) for name, value in random_parameters(rng, config, task, run.dtype).items()}
         image = rng.integers(0, 256, (2, 8, 4, 2)).astype(np.uint8)
         x = image / 255 - 0.5
@@ -383,14 +462,26 @@ def compare_image_stages(run: Run, kinds: Iterable[tuple[str, bool]]) -> None:
         run.compare(f"{sampling} encoder", tokens, x.reshape(2, -1), magnitude="tensor", factor=4)
         feature = run.cast(rng.normal(size=(2, config.feature_size)))
         expected = networks.decoder(params, feature, task, config)
-        run.compare(f"{sampling} decoder", run.call("decoder", params, feature, task, config), expected, magnitude="tensor", factor=4)
+        run.compare(
+            f"{sampling} decoder",
+            run.call("decoder", params, feature, task, config),
+            expected,
+            magnitude="tensor",
+            factor=4,
+        )
 
 
 @check("LAY-15", "CON-8", uses=[*SUMS, "rms_norm", "max_pool", "upsample", "dense", "mlp", "truncated_normal"], level=0)
 def layers_refuse_shapes(run: Run) -> None:
     """Sizes that do not fit, odd sides, other strides, images without channels, no layers and no fan are refused."""
     shape: tuple[int, ...]
-    x, kernel, blocks, taps, bias = np.ones((2, 4)), np.ones((4, 6)), np.ones((2, 2, 3)), np.ones((5, 5, 2, 6)), np.zeros(6)
+    x, kernel, blocks, taps, bias = (
+        np.ones((2, 4)),
+        np.ones((4, 6)),
+        np.ones((2, 2, 3)),
+        np.ones((5, 5, 2, 6)),
+        np.zeros(6),
+    )
     for shape in ((2, 3), (2, 1)):
         wrong: np.ndarray = np.ones(shape)
         run.refuses("linear", wrong, kernel, bias)
@@ -430,7 +521,11 @@ def rows_do_not_mix(run: Run) -> None:
     """A NaN in one element of a batch stays in it, and the other elements keep every bit."""
     rng = run.rng()
     x, image = run.cast(rng.normal(size=(3, 2, 4))), run.cast(rng.normal(size=(3, 2, 4, 6, 4)))
-    kernel, taps, bias = run.cast(rng.normal(size=(4, 6))), run.cast(rng.normal(size=(5, 5, 4, 6))), run.cast(rng.normal(size=6))
+    kernel, taps, bias = (
+        run.cast(rng.normal(size=(4, 6))),
+        run.cast(rng.normal(size=(5, 5, 4, 6))),
+        run.cast(rng.normal(size=6)),
+    )
     cases: tuple[tuple[str, np.ndarray, tuple[Any, ...]], ...] = (
         ("linear", x, (kernel, bias)),
         ("block_linear", x, (kernel.reshape(2, 2, 6), np.append(bias, bias))),

@@ -13,7 +13,8 @@ from conformance.strategies import adversarial_numbers, arrays, normals, seeds
 from reference_numpy import networks as reference
 from spec import Config, Discrete, Image, Spaces, Vector, parameter_table
 
-# A capital letter sorts before all small ones. The mapping of observations is given in another order than the sorted one.
+# A capital letter sorts before all small ones. The mapping of observations is given in another order than the sorted
+# one.
 VECTORS: dict[str, Vector | Discrete] = {"position": Vector(3), "mode": Discrete((3, 2)), "Speed": Vector(2)}
 IMAGES: dict[str, Image] = {"image": Image(8, 12, 3), "depth": Image(8, 12, 1)}
 ACTIONS: dict[str, Vector | Discrete] = {"turn": Vector(2), "buttons": Discrete((2, 3)), "Arm": Vector(1)}
@@ -54,7 +55,10 @@ def params_of(run: Run, config: Config, task: Spaces = TASK, seed: int = 0) -> d
 
 def zero_parameters(config: Config, task: Spaces) -> dict[str, np.ndarray]:
     """All zero, but for the scales of RMSNorm, which are one."""
-    return {name: np.full(entry.shape, float(entry.initializer == "ones")) for name, entry in parameter_table(config, task).items()}
+    return {
+        name: np.full(entry.shape, float(entry.initializer == "ones"))
+        for name, entry in parameter_table(config, task).items()
+    }
 
 
 def observations_of(seed: int, task: Spaces, leading: tuple[int, ...] = (ROWS,)) -> dict[str, np.ndarray]:
@@ -67,8 +71,13 @@ def features_of(run: Run, config: Config, *leading: int, seed: int = 0) -> np.nd
 
 
 def largest(result: Any) -> Any:
-    """The largest number of every array of a nested result, but at least 1: a few numbers may happen to be all small."""
-    return {key: largest(value) for key, value in result.items()} if isinstance(result, dict) else max(1.0, np.abs(result).max())
+    """The largest number of every array of a nested result, but at least 1: a few numbers may happen to be all
+    small."""
+    return (
+        {key: largest(value) for key, value in result.items()}
+        if isinstance(result, dict)
+        else max(1.0, np.abs(result).max())
+    )
 
 
 def activated(*values: float) -> np.ndarray:
@@ -79,18 +88,26 @@ def activated(*values: float) -> np.ndarray:
 
 @check("NET-3", "NET-5", "CON-25", uses=["encoder"], level=1)
 def encoded_vector_literals(run: Run) -> None:
-    """speed (0, e - 1) and item (2, 0) of Discrete((3, 2)) enter as (0, 0, 1, 1, 0, 0, 1): sorted keys, one-hots, symlog."""
+    """speed (0, e - 1) and item (2, 0) of Discrete((3, 2)) enter as (0, 0, 1, 1, 0, 0, 1): sorted keys, one-hots,
+    symlog."""
     task = Spaces({"speed": Vector(2), "item": Discrete((3, 2))}, ACTIONS)
     config = config_of(run, units=7, encoder_layers=1, norm_epsilon=0.0)
     params = zero_parameters(config, task) | {"encoder/vector/hidden0/kernel": np.eye(7)}
     observations = {"speed": np.array([[0, math.e - 1]], np.float32), "item": np.array([[2, 0]])}
     expected = activated(0, 0, 1, 1, 0, 0, 1)[None]
-    run.expect("encoder", (params, observations, task, config), expected, magnitude="tensor", bound=1e-6 if run.u < 1e-10 else None)
+    run.expect(
+        "encoder",
+        (params, observations, task, config),
+        expected,
+        magnitude="tensor",
+        bound=1e-6 if run.u < 1e-10 else None,
+    )
 
 
 @check("NET-2", "NET-3", "NET-5", "NET-11", "NET-26", "CON-24", "CON-26", uses=["encoder"], level=1)
 def encoder_of_vectors_matches(run: Run) -> None:
-    """Tokens of vectors that hold zeros, subnormals and the largest float32, and of discrete entries; nothing else is read."""
+    """Tokens of vectors that hold zeros, subnormals and the largest float32, and of discrete entries; nothing else is
+    read."""
     config = config_of(run, encoder_layers=2)
     numbers = st.one_of(adversarial_numbers(finite=True), st.sampled_from([LARGEST, -LARGEST]))
 
@@ -100,7 +117,11 @@ def encoder_of_vectors_matches(run: Run) -> None:
         vectors = {"position": position.astype(np.float32), "Speed": speed.astype(np.float32)}
         observations = observations_of(seed, VECTOR_TASK) | vectors
         expected = reference.encoder(params, observations, VECTOR_TASK, config)
-        other = {"reward": np.full(ROWS, np.nan), "is_first": np.ones(ROWS, bool), "prev_action": np.full((ROWS, 8), np.nan)}
+        other = {
+            "reward": np.full(ROWS, np.nan),
+            "is_first": np.ones(ROWS, bool),
+            "prev_action": np.full((ROWS, 8), np.nan),
+        }
         run.expect("encoder", (params, other | observations, VECTOR_TASK, config), expected, magnitude="tensor")
 
 
@@ -112,14 +133,26 @@ def integers_of_any_kind(run: Run) -> None:
     before = run.call("encoder", params, observations, VECTOR_TASK, config)
     for dtype in (np.uint8, np.int32, np.int64):
         mode = observations["mode"].astype(dtype)
-        run.exact(f"tokens of {mode.dtype}", run.call("encoder", params, observations | {"mode": mode}, VECTOR_TASK, config), before)
+        run.exact(
+            f"tokens of {mode.dtype}",
+            run.call("encoder", params, observations | {"mode": mode}, VECTOR_TASK, config),
+            before,
+        )
     for real in (np.float32, np.float64):
-        run.refuses("encoder", params, observations | {"mode": observations["mode"].astype(real)}, VECTOR_TASK, config, naming=["mode"])
+        run.refuses(
+            "encoder",
+            params,
+            observations | {"mode": observations["mode"].astype(real)},
+            VECTOR_TASK,
+            config,
+            naming=["mode"],
+        )
 
 
 @check("NET-2", "NET-24", uses=["encoder"], level=1)
 def non_finite_vectors_show(run: Run) -> None:
-    """NaN or infinity in a vector gives tokens that are not finite in its own row, and changes nothing in the others."""
+    """NaN or infinity in a vector gives tokens that are not finite in its own row, and changes nothing in the
+    others."""
     config = config_of(run)
     params, observations = params_of(run, config, VECTOR_TASK), observations_of(run.seed, VECTOR_TASK)
     before = np.asarray(run.call("encoder", params, observations, VECTOR_TASK, config))
@@ -134,14 +167,18 @@ def non_finite_vectors_show(run: Run) -> None:
 
 @check("NET-6", "NET-8", "NET-9", "NET-10", uses=["encoder"], level=1)
 def brightness_literals(run: Run) -> None:
-    """Brightness 0, 1, 127, 128 and 255 enters as -0.5, -0.4961, -0.00196, 0.00196 and 0.5, also in a picture that holds nothing else."""
+    """Brightness 0, 1, 127, 128 and 255 enters as -0.5, -0.4961, -0.00196, 0.00196 and 0.5, also in a picture that
+    holds nothing else."""
     task = Spaces({"image": Image(4, 4, 1)}, ACTIONS)
     config = config_of(run, 1, cnn_multipliers=(2, 2), cnn_depth=1, norm_epsilon=0.0)
     params = zero_parameters(config, task) | {"encoder/image/conv0/bias": np.array([0.0, 1.0])}
     params["encoder/image/conv0/kernel"][1, 1, 0, 0] = 1  # the top left pixel of four, beside a constant channel
     params["encoder/image/conv1/kernel"][1, 1] = np.eye(2)
     entering = {0: -0.5, 1: -0.49607843137, 127: -0.00196078431, 128: 0.00196078431, 255: 0.5}
-    for brightness in ([0, 1, 127, 128, 255], [1, 0, 1, 1, 0]):  # pictures without any number above 1 are scaled like all others
+    for brightness in (
+        [0, 1, 127, 128, 255],
+        [1, 0, 1, 1, 0],
+    ):  # pictures without any number above 1 are scaled like all others
         image = np.broadcast_to(np.array(brightness, np.uint8)[:, None, None, None], (5, 4, 4, 1)).copy()
         expected = np.array([activated(*activated(entering[number], 1)) for number in brightness])
         bound = 1e-9 if run.u < 1e-10 else None
@@ -159,19 +196,32 @@ def pooling_comes_before_normalization(run: Run) -> None:
     image = np.zeros((1, 4, 4, 2), np.uint8)
     image[:, 0::2, 0::2, 0] = image[:, 0::2, 1::2, 1] = 255
     expected = activated(0.594189, 0.855420)[None]
-    run.expect("encoder", (params, {"image": image}, task, config), expected, magnitude="tensor", bound=2e-6 if run.u < 1e-10 else None)
+    run.expect(
+        "encoder",
+        (params, {"image": image}, task, config),
+        expected,
+        magnitude="tensor",
+        bound=2e-6 if run.u < 1e-10 else None,
+    )
 
 
 @check("NET-6", "NET-26", uses=["encoder"], level=1)
 def brightness_is_scaled_in_float32(run: Run) -> None:
-    """The two greys nearest to 0 differ by 1/255 whatever the compute dtype: bfloat16 would halve or double one of them."""
+    """The two greys nearest to 0 differ by 1/255 whatever the compute dtype: bfloat16 would halve or double one of
+    them."""
     task = Spaces({"image": Image(8, 8, 1)}, ACTIONS)
     config = config_of(run, norm_epsilon=1e-12)
     params = params_of(run, config, task)
-    params |= {name: np.zeros_like(value) for name, value in params.items() if name.startswith("encoder/image/") and name.endswith("bias")}
+    params |= {
+        name: np.zeros_like(value)
+        for name, value in params.items()
+        if name.startswith("encoder/image/") and name.endswith("bias")
+    }
     observations = {"image": run.rng().integers(127, 129, (ROWS, 8, 8, 1)).astype(np.uint8)}
     expected = reference.encoder(params, observations, task, config)
-    bound = {"float64": 1e-11, "float32": 1e-3, "bfloat16": 0.125}[run.dtype]  # x / 255 - 1/2 loses the digits that cancel
+    bound = {"float64": 1e-11, "float32": 1e-3, "bfloat16": 0.125}[
+        run.dtype
+    ]  # x / 255 - 1/2 loses the digits that cancel
     run.expect("encoder", (params, observations, task, config), expected, magnitude="tensor", bound=bound)
 
 
@@ -198,7 +248,8 @@ def compare_encoders(run: Run, kinds: list[int]) -> None:
 
 @check("NET-14", "NET-18", "NET-19", "NET-26", uses=["decoder"], level=1)
 def decoder_literals(run: Run) -> None:
-    """With zero weights: vectors and logits are the biases as they are, images the sigmoid of theirs, computed in float32 or better."""
+    """With zero weights: vectors and logits are the biases as they are, images the sigmoid of theirs, computed in
+    float32 or better."""
     config = config_of(run)
     biases = {
         "decoder/vector/out/position/bias": np.array([20.0, -3.0, 0.5]),
@@ -218,11 +269,14 @@ def decoder_literals(run: Run) -> None:
 
 @check("NET-16", "NET-17", "NET-19", uses=["decoder"], level=1)
 def stem_literals(run: Run) -> None:
-    """2 blocks, a 1 x 2 map of 4 channels: outputs 0 1 4 5 and 2 3 6 7 of the memory, 0 1 2 3 and 4 5 6 7 of the latents share a pixel."""
+    """2 blocks, a 1 x 2 map of 4 channels: outputs 0 1 4 5 and 2 3 6 7 of the memory, 0 1 2 3 and 4 5 6 7 of the
+    latents share a pixel."""
     task = Spaces({"wide": Image(4, 8, 3), "thin": Image(4, 8, 1)}, ACTIONS)
     config = config_of(run, 1, cnn_multipliers=(4, 4), cnn_depth=1, norm_epsilon=1e-20)
     params = zero_parameters(config, task)
-    params["decoder/image/conv0/kernel"][1, 1] = params["decoder/image/out/kernel"][1, 1] = np.eye(4)  # pixel i becomes pixel 2i
+    params["decoder/image/conv0/kernel"][1, 1] = params["decoder/image/out/kernel"][1, 1] = np.eye(
+        4
+    )  # pixel i becomes pixel 2i
     numbers = np.arange(8.0)
     cases = {
         "deter": ([0, 1, 4, 5], [2, 3, 6, 7]),
@@ -238,7 +292,8 @@ def stem_literals(run: Run) -> None:
 
 @check(*(f"NET-{n}" for n in range(13, 20)), "NET-1", uses=["decoder"], level=1)
 def decoder_matches(run: Run) -> None:
-    """Reconstructions of vectors and images together and of each alone, with the kind of convolutions that the profile has."""
+    """Reconstructions of vectors and images together and of each alone, with the kind of convolutions that the profile
+    has."""
     compare_decoders(run, own_convolutions(run), (TASK, IMAGE_TASK, VECTOR_TASK))
 
 
@@ -256,17 +311,22 @@ def compare_decoders(run: Run, kinds: list[int], tasks: tuple[Spaces, ...]) -> N
             expected = reference.decoder(params, feature, task, config)
             actual = run.expect("decoder", (params, feature, task, config), expected, magnitude=largest(expected))
             for key in task.images:
-                run.holds(f"{key} lies between 0 and 1", (np.asarray(actual[key]) >= 0) & (np.asarray(actual[key]) <= 1))
+                run.holds(
+                    f"{key} lies between 0 and 1", (np.asarray(actual[key]) >= 0) & (np.asarray(actual[key]) <= 1)
+                )
 
 
 @check("NET-15", "NET-16", "NET-1", uses=["decoder"], level=1)
 def image_decoder_separates_memory_and_latents(run: Run) -> None:
-    """With only the memory's or only the latents' path, images depend on the first deter entries of the feature or on the others alone."""
+    """With only the memory's or only the latents' path, images depend on the first deter entries of the feature or on
+    the others alone."""
     config = config_of(run)
     params, feature = params_of(run, config, IMAGE_TASK), features_of(run, config, ROWS)
     for path, kept in (("deter", slice(0, config.deter)), ("stoch", slice(config.deter, None))):
         other = "stoch" if path == "deter" else "deter"
-        silenced = params | {f"decoder/image/{other}/{part}": 0 * params[f"decoder/image/{other}/{part}"] for part in ("kernel", "bias")}
+        silenced = params | {
+            f"decoder/image/{other}/{part}": 0 * params[f"decoder/image/{other}/{part}"] for part in ("kernel", "bias")
+        }
         changed = features_of(run, config, ROWS, seed=1)
         changed[:, kept] = feature[:, kept]
         before = run.call("decoder", silenced, feature, IMAGE_TASK, config)
@@ -281,7 +341,11 @@ def heads_literals(run: Run) -> None:
     """With zero weights every head returns the biases of its output layer exactly: no tanh, no sigmoid, no mixture."""
     config = config_of(run)
     logits = np.arange(-15.0, 16) * 8
-    params = zero_parameters(config, VECTOR_TASK) | {"reward/out/bias": logits, "critic/out/bias": -logits, "continue/out/bias": [-300.0]}
+    params = zero_parameters(config, VECTOR_TASK) | {
+        "reward/out/bias": logits,
+        "critic/out/bias": -logits,
+        "continue/out/bias": [-300.0],
+    }
     biases: dict[str, dict[str, list[float]]] = {
         "Arm": {"mean": [300.0], "std": [-7.0]},
         "buttons": {"logits": [1.0, -100.0, 3.0, 0.0, 64.0]},
@@ -347,7 +411,11 @@ def leading_axes(run: Run) -> None:
 def rows_do_not_influence_each_other(run: Run) -> None:
     """Other observations or features in one row change nothing in the others."""
     config = config_of(run)
-    params, observations, feature = params_of(run, config), observations_of(run.seed, TASK), features_of(run, config, ROWS)
+    params, observations, feature = (
+        params_of(run, config),
+        observations_of(run.seed, TASK),
+        features_of(run, config, ROWS),
+    )
     changed = {key: value.copy() for key, value in observations.items()}
     for value in changed.values():
         value[0] = 1
@@ -380,17 +448,34 @@ def sides_that_cannot_be_halved(run: Run) -> None:
 
 @check("NET-2", "NET-6", "NET-27", "CON-6", "CON-8", uses=["encoder"], level=1)
 def encoder_refuses(run: Run) -> None:
-    """A missing key, a shape that does not fit, different numbers of rows, and images that are not uint8 are refused."""
+    """A missing key, a shape that does not fit, different numbers of rows, and images that are not uint8 are
+    refused."""
     config = config_of(run)
     params, observations = params_of(run, config), observations_of(run.seed, TASK)
     for key, value in observations.items():
-        run.refuses("encoder", params, {name: x for name, x in observations.items() if name != key}, TASK, config, naming=[key])
+        run.refuses(
+            "encoder", params, {name: x for name, x in observations.items() if name != key}, TASK, config, naming=[key]
+        )
         shorter = value[..., :-1]
-        run.refuses("encoder", params, observations | {key: shorter}, TASK, config, naming=[key, ", ".join(map(str, shorter.shape))])
+        run.refuses(
+            "encoder",
+            params,
+            observations | {key: shorter},
+            TASK,
+            config,
+            naming=[key, ", ".join(map(str, shorter.shape))],
+        )
         for rows in (1, 2):
             run.refuses("encoder", params, observations | {key: value[:rows]}, TASK, config)
     for dtype in (np.float32, np.int64, np.int8):
-        run.refuses("encoder", params, observations | {"image": observations["image"].astype(dtype)}, TASK, config, naming=["image"])
+        run.refuses(
+            "encoder",
+            params,
+            observations | {"image": observations["image"].astype(dtype)},
+            TASK,
+            config,
+            naming=["image"],
+        )
     flipped = observations | {"image": observations["image"].swapaxes(1, 2).copy()}
     run.refuses("encoder", params, flipped, TASK, config)
 

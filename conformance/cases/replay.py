@@ -1,4 +1,5 @@
-"""Checks of spec/11-replay.md. Every entry of a record tells its position and its worker, so whatever comes out says where it was."""
+"""Checks of spec/11-replay.md. Every entry of a record tells its position and its worker, so whatever comes out says
+where it was."""
 
 import sys
 import tracemalloc
@@ -17,8 +18,19 @@ Arrays = dict[str, np.ndarray]
 Item = tuple[int, int]
 
 LATENTS = ("deter", "stoch")
-TYPES = {"x": "float32", "image": "uint8", "mode": "int64", "reward": "float32", "is_first": "bool", "is_last": "bool",
-         "is_terminal": "bool", "prev_action": "float32", "deter": "float32", "stoch": "int32", "ids": "int64"}  # fmt: skip
+TYPES = {
+    "x": "float32",
+    "image": "uint8",
+    "mode": "int64",
+    "reward": "float32",
+    "is_first": "bool",
+    "is_last": "bool",
+    "is_terminal": "bool",
+    "prev_action": "float32",
+    "deter": "float32",
+    "stoch": "int32",
+    "ids": "int64",
+}
 REQUIRED = ("reward", "is_first", "is_last", "is_terminal", "action", *LATENTS)
 
 
@@ -47,7 +59,10 @@ def filled(run: Run, records: int, capacity: int = 100, length: int = 2, workers
 
 
 def latents(rows: int, length: int, value: float) -> Arrays:
-    return {"deter": np.full((rows, length, 3), value, np.float32), "stoch": np.full((rows, length, 2), int(value) % 64, np.int32)}
+    return {
+        "deter": np.full((rows, length, 3), value, np.float32),
+        "stoch": np.full((rows, length, 2), int(value) % 64, np.int32),
+    }
 
 
 def starts(batch: Arrays) -> list[int]:
@@ -64,7 +79,9 @@ def refuses(run: Run, words: tuple[str, ...], function: Callable[..., Any], *arg
     try:
         function(*args)
     except ValueError as error:
-        run.holds(f"the message {str(error)!r} names {words}", bool(str(error)) and all(word in str(error) for word in words))
+        run.holds(
+            f"the message {str(error)!r} names {words}", bool(str(error)) and all(word in str(error) for word in words)
+        )
         return
     run.holds(f"a ValueError of {function.__name__} that names {words}", False)
 
@@ -106,7 +123,9 @@ class Ledger:
 
     def batch(self, chosen: list[Item]) -> Arrays:
         rows = [self.streams[number][start : start + self.length + 1] for number, start in chosen]
-        batch = {key: np.array([[step[key] for step in row[1:]] for row in rows]) for key in rows[0][0] if key not in LATENTS}
+        batch = {
+            key: np.array([[step[key] for step in row[1:]] for row in rows]) for key in rows[0][0] if key not in LATENTS
+        }
         batch["prev_action"] = np.array([[step["action"] for step in row[:-1]] for row in rows])
         del batch["action"]
         for row, b in zip(rows, range(len(rows)), strict=True):
@@ -146,9 +165,12 @@ def compare_arrays(run: Run, where: str, actual: Any, expected: Arrays) -> None:
 
 @check(*(f"REP-{n}" for n in range(1, 27) if n not in (6, 13)), uses=["Replay"], level=0)
 def histories_match_the_definition(run: Run) -> None:
-    """Whatever is added, drawn, written back, saved and loaded by several workers in any order follows from the list of all records."""
+    """Whatever is added, drawn, written back, saved and loaded by several workers in any order follows from the list of
+    all records."""
 
-    @run.for_all(seed=seeds(), length=st.integers(1, 4), capacity=st.sampled_from([1, 2, 7, 20]), workers=st.integers(1, 3))
+    @run.for_all(
+        seed=seeds(), length=st.integers(1, 4), capacity=st.sampled_from([1, 2, 7, 20]), workers=st.integers(1, 3)
+    )
     def _(seed: int, length: int, capacity: int, workers: int) -> None:
         rng = np.random.default_rng(seed)
         replay, ledger, drawn = run.call("Replay", capacity, length), Ledger(length), [np.zeros((1, 2), np.int64)]
@@ -184,9 +206,24 @@ def histories_match_the_definition(run: Run) -> None:
                 run.exact("len after loading", len(replay), len(ledger.items))
 
 
-@check("REP-2", "REP-4", "REP-5", "REP-7", "REP-8", "REP-12", "REP-14", "REP-15", "REP-18", "REP-20", "REP-22", uses=["Replay"], level=0)
+@check(
+    "REP-2",
+    "REP-4",
+    "REP-5",
+    "REP-7",
+    "REP-8",
+    "REP-12",
+    "REP-14",
+    "REP-15",
+    "REP-18",
+    "REP-20",
+    "REP-22",
+    uses=["Replay"],
+    level=0,
+)
 def a_small_buffer_by_hand(run: Run) -> None:
-    """T = 2, capacity 3, records 0 to 5: row 0 comes from the queue, row 1 is drawn, and record 3 keeps the latents of row 1."""
+    """T = 2, capacity 3, records 0 to 5: row 0 comes from the queue, row 1 is drawn, and record 3 keeps the latents of
+    row 1."""
     replay = filled(run, 6, capacity=3)
     run.exact("len", len(replay), 3)
     batch = replay.sample([0.0, 0.5])
@@ -203,13 +240,21 @@ def a_small_buffer_by_hand(run: Run) -> None:
 
 @check("REP-14", "REP-19", uses=["Replay"], level=0)
 def entries_and_types_of_a_batch(run: Run) -> None:
-    """A batch has exactly the entries of the chapter in their types; observations keep theirs, and deter keeps every bit of float32."""
+    """A batch has exactly the entries of the chapter in their types; observations keep theirs, and deter keeps every
+    bit of float32."""
     replay = filled(run, 9, length=3)
     batch = replay.sample([0.0, 0.3, 0.9, 0.2])
     run.holds(f"the entries {sorted(batch)}", set(batch) == set(TYPES))
     for key, dtype in TYPES.items():
         run.holds(f"{key} has the type {dtype}, got {batch[key].dtype}", batch[key].dtype == dtype)
-    shapes = {"image": (4, 3, 2, 3, 1), "mode": (4, 3, 1), "prev_action": (4, 3, 2), "deter": (4, 3), "stoch": (4, 2), "ids": (4, 2)}
+    shapes = {
+        "image": (4, 3, 2, 3, 1),
+        "mode": (4, 3, 1),
+        "prev_action": (4, 3, 2),
+        "deter": (4, 3),
+        "stoch": (4, 2),
+        "ids": (4, 2),
+    }
     for key, shape in shapes.items():
         run.holds(f"{key} has the shape {shape}, got {batch[key].shape}", batch[key].shape == shape)
     run.exact("deter", batch["deter"][:, 2], 1 / (np.array(starts(batch)) + 1).astype(np.float32))
@@ -217,7 +262,8 @@ def entries_and_types_of_a_batch(run: Run) -> None:
 
 @check("REP-7", "REP-8", "REP-9", uses=["Replay"], level=0)
 def the_queue_of_the_paper(run: Run) -> None:
-    """With T = 64 the entries arrive with records 65, 130, 195 and start at 1, 66, 131: nothing is missed but record 0."""
+    """With T = 64 the entries arrive with records 65, 130, 195 and start at 1, 66, 131: nothing is missed but record
+    0."""
     replay, served = run.call("Replay", 1000, 64), []
     for n in range(200):
         replay.add(record(n), 0)
@@ -234,7 +280,8 @@ def the_queue_of_the_paper(run: Run) -> None:
 
 @check("REP-1", "REP-8", "REP-10", "REP-11", "REP-12", uses=["Replay"], level=0)
 def one_queue_for_all_workers(run: Run) -> None:
-    """Entries of two workers are served in the order in which they were queued; rows after them use the uniforms at their own place."""
+    """Entries of two workers are served in the order in which they were queued; rows after them use the uniforms at
+    their own place."""
     replay = filled(run, 7, workers=2)  # queued with records 3 and 6
     run.exact("offline", replay.sample([0.0, 0.99], online=False)["ids"], [[0, 0], [1, 4]])
     batch = replay.sample([0.99, 0.99, 0.0, 0.0, 0.15, 0.99])
@@ -244,20 +291,28 @@ def one_queue_for_all_workers(run: Run) -> None:
 
 @check("REP-12", uses=["Replay"], level=0)
 def uniform_numbers_choose_items(run: Run) -> None:
-    """Number u chooses item floor(u n) of n in float64, counted from the oldest, also when many items have been removed."""
+    """Number u chooses item floor(u n) of n in float64, counted from the oldest, also when many items have been
+    removed."""
     uniform = [0.0, 0.0999, 0.1, 0.5 - 2.0**-40, 0.5, 0.55, float(np.nextafter(1, 0))]
     for records, oldest in ((12, 0), (15, 3), (33, 21)):
         expected = oldest + np.array([0, 0, 1, 4, 5, 5, 9])
-        run.exact(f"after {records} records", starts(filled(run, records, capacity=10).sample(uniform, online=False)), expected)
+        run.exact(
+            f"after {records} records",
+            starts(filled(run, records, capacity=10).sample(uniform, online=False)),
+            expected,
+        )
 
 
 @check("REP-15", "REP-16", "REP-17", uses=["Replay"], level=0)
 def flags_inside_a_sequence(run: Run) -> None:
-    """An abandoned episode ends where the next one begins, except at the last position; nothing else is changed or masked."""
+    """An abandoned episode ends where the next one begins, except at the last position; nothing else is changed or
+    masked."""
     firsts, lasts = [False, False, True, False, True], [False, False, False, True, False]
     replay = run.call("Replay", 10, 3)
     for n in range(5):
-        replay.add(record(n, is_first=np.array(firsts[n]), is_last=np.array(lasts[n]), is_terminal=np.array(lasts[n])), 0)
+        replay.add(
+            record(n, is_first=np.array(firsts[n]), is_last=np.array(lasts[n]), is_terminal=np.array(lasts[n])), 0
+        )
     batch = replay.sample([0.0, 0.9], online=False)
     run.exact("is_first", batch["is_first"], [[False, True, False], [True, False, True]])
     run.exact("is_last", batch["is_last"], [[True, False, True], [False, True, False]])
@@ -268,7 +323,8 @@ def flags_inside_a_sequence(run: Run) -> None:
 
 @check("REP-6", "REP-23", uses=["Replay"], level=0)
 def nothing_shares_memory(run: Run) -> None:
-    """Writing into what was given to add, write_back or load_state_dict, or came from sample or state_dict, changes nothing."""
+    """Writing into what was given to add, write_back or load_state_dict, or came from sample or state_dict, changes
+    nothing."""
 
     def spoil(arrays: Any) -> None:
         for array in arrays.values():
@@ -297,7 +353,8 @@ def nothing_shares_memory(run: Run) -> None:
 
 @check("REP-5", "REP-20", "REP-21", uses=["Replay"], level=0)
 def write_back_to_evicted_records(run: Run) -> None:
-    """Positions that are gone are skipped one by one, streams that are gone or never were altogether; the context is not touched."""
+    """Positions that are gone are skipped one by one, streams that are gone or never were altogether; the context is
+    not touched."""
     replay = filled(run, 5, capacity=3, length=3)
     ids = replay.sample([0.0], online=False)["ids"]
     run.exact("ids", ids, [[0, 0]])
@@ -312,11 +369,15 @@ def write_back_to_evicted_records(run: Run) -> None:
 
 @check("REP-23", "REP-24", "REP-25", uses=["Replay"], level=0)
 def saving_and_loading(run: Run) -> None:
-    """The state is plain arrays with the records that belong to items; loading replaces everything and begins new streams."""
+    """The state is plain arrays with the records that belong to items; loading replaces everything and begins new
+    streams."""
     replay = filled(run, 6, capacity=5, workers=2)
     replay.add(record(0, 2), 2)  # stream 2 has no item
     state = replay.state_dict()
-    run.holds("every entry is an array of numbers", [isinstance(x, np.ndarray) and x.dtype.kind in "biuf" for x in state.values()])
+    run.holds(
+        "every entry is an array of numbers",
+        [isinstance(x, np.ndarray) and x.dtype.kind in "biuf" for x in state.values()],
+    )
     for key, value in {
         "length": 2,
         "next_stream": 3,
@@ -371,15 +432,17 @@ def bad_records_are_refused(run: Run) -> None:
         without = {name: value for name, value in record(2).items() if name != key}
         refuses(run, (key,), replay.add, without, 0)
     refuses(run, ("extra",), replay.add, record(2, extra=np.zeros(1)), 0)
-    for key, wrong in (("x", np.zeros(7, np.float32)), ("action", np.zeros(7, np.float32)), ("image", np.zeros((2, 7, 1), np.uint8)),
-                       ("reward", np.zeros(7, np.float32)), ("deter", np.zeros((7, 1), np.float32))):  # fmt: skip
+    shapes = {"x": (7,), "action": (7,), "image": (2, 7, 1), "reward": (7,), "deter": (7, 1)}
+    for key, shape in shapes.items():
+        wrong = np.zeros(shape, np.uint8 if key == "image" else np.float32)
         refuses(run, (key, "7"), replay.add, {**record(2), key: wrong}, 0)
     replay.add(record(2), 0)
     run.exact("x of the records that were accepted", replay.sample([0.0])["x"][..., 0], [[1, 2]])
 
 
 def effort(function: Callable[..., Any], *args: Any) -> tuple[int, int]:
-    """What 40 calls cost, counted and not timed: lines of Python that ran in all, and the memory that the most modest call took."""
+    """What 40 calls cost, counted and not timed: lines of Python that ran in all, and the memory that the most modest
+    call took."""
     lines, taken, before = 0, [], sys.gettrace()
 
     def count(frame: FrameType, event: str, argument: Any) -> Any:
@@ -403,7 +466,8 @@ def effort(function: Callable[..., Any], *args: Any) -> tuple[int, int]:
 
 @check("REP-28", uses=["Replay"], level=0)
 def effort_does_not_grow_with_the_buffer(run: Run) -> None:
-    """Adding and drawing run no more code and copy no more with 10 000 items, growing or full, than with 200, within a factor of 2.
+    """Adding and drawing run no more code and copy no more with 10 000 items, growing or full, than with 200, within a
+    factor of 2.
 
     What a loop inside of compiled code costs is not seen.
     """
@@ -414,7 +478,9 @@ def effort_does_not_grow_with_the_buffer(run: Run) -> None:
             replay.add(step, 0)
         efforts.append((effort(replay.add, step, 0), effort(replay.sample, [0.3, 0.9], False)))
     for index, where in enumerate(("add", "sample")):
-        for unit, (small, full, growing) in zip(("lines", "bytes"), zip(*(entry[index] for entry in efforts), strict=True), strict=True):
+        for unit, (small, full, growing) in zip(
+            ("lines", "bytes"), zip(*(entry[index] for entry in efforts), strict=True), strict=True
+        ):
             message = f"{where}: {small} {unit} with 200 items, with 10 000 {full} when full and {growing} before"
             run.holds(message, max(full, growing) <= 2 * small + 100)
 

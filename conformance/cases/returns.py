@@ -29,9 +29,14 @@ def replayed(run: Run, seed: int, length: int) -> tuple[np.ndarray, np.ndarray, 
 
 @check("RET-1", uses=["lambda_return"], level=0)
 def lambda_return_literals(run: Run) -> None:
-    """With gamma = lambda = 1/2, rewards 9,1,0,2, continues 1,1,.5,1 and values 7,4,2,10 the returns are 2.28125, 1.125, 7."""
+    """With gamma = lambda = 1/2, rewards 9,1,0,2, continues 1,1,.5,1 and values 7,4,2,10 the returns are 2.28125,
+    1.125, 7."""
     reward, continue_, value = np.array([[9.0, 1, 0, 2]]), np.array([[1, 1, 0.5, 1]]), np.array([[7.0, 4, 2, 10]])
-    run.exact("lambda_return", run.call("lambda_return", reward, continue_, value, 0.5, 0.5), np.array([[2.28125, 1.125, 7.0]]))
+    run.exact(
+        "lambda_return",
+        run.call("lambda_return", reward, continue_, value, 0.5, 0.5),
+        np.array([[2.28125, 1.125, 7.0]]),
+    )
     reward, value = np.array([[0.0, 0, 0, 1, 0]]), np.array([[2.0, 2, 2, 1, 1]])
     expected = np.array([[1.9831, 1.9885, 1.9942, 0.9970]])
     run.expect("lambda_return", (reward, np.ones((1, 5)), value, GAMMA, 0.95), expected, bound=5e-5)
@@ -46,7 +51,9 @@ def lambda_return_matches(run: Run) -> None:
         reward, continue_, value = imagined(run, seed, horizon)
         magnitude = reference.lambda_return(np.abs(reward), continue_, np.abs(value), GAMMA, lambda_)
         expected = reference.lambda_return(reward, continue_, value, GAMMA, lambda_)
-        run.expect("lambda_return", (reward, continue_, value, GAMMA, lambda_), expected, magnitude=magnitude, bound=64 * run.u)
+        run.expect(
+            "lambda_return", (reward, continue_, value, GAMMA, lambda_), expected, magnitude=magnitude, bound=64 * run.u
+        )
 
 
 @check("RET-2", uses=["lambda_return"], level=0)
@@ -61,13 +68,20 @@ def lambda_return_ignores_the_start(run: Run) -> None:
 
 @check("RET-7", uses=["cumulative_weights"], level=0)
 def weights_literals(run: Run) -> None:
-    """Weights are 1, gamma, gamma^2, ... without ends; a certain end silences all that follows; the last continue is not used."""
+    """Weights are 1, gamma, gamma^2, ... without ends; a certain end silences all that follows; the last continue is
+    not used."""
     run.expect("cumulative_weights", (np.ones((1, 4)), GAMMA), np.array([[1, GAMMA, GAMMA**2]]), bound=16 * run.u)
     continue_ = np.array([[1, 1, 0, 1, 1], [0, 1, 1, 1, 1], [0.5, 0.5, 1, 1, 0]])
     expected = np.array([[1, 0.5, 0, 0], [0, 0, 0, 0], [0.5, 0.125, 0.0625, 0.03125]])
     run.exact("cumulative_weights", run.call("cumulative_weights", continue_, 0.5), expected)
-    run.exact("the last continue is NaN", run.call("cumulative_weights", np.array([[0.5, 1, np.nan]]), 0.5), np.array([[0.5, 0.25]]))
-    run.exact("a discount of 1", run.call("cumulative_weights", np.array([[0.5, 0.5, 1]]), 1.0), np.array([[0.5, 0.25]]))
+    run.exact(
+        "the last continue is NaN",
+        run.call("cumulative_weights", np.array([[0.5, 1, np.nan]]), 0.5),
+        np.array([[0.5, 0.25]]),
+    )
+    run.exact(
+        "a discount of 1", run.call("cumulative_weights", np.array([[0.5, 0.5, 1]]), 1.0), np.array([[0.5, 0.25]])
+    )
 
 
 @check("RET-7", uses=["cumulative_weights"], level=0)
@@ -77,7 +91,12 @@ def weights_match(run: Run) -> None:
     @run.for_all(seed=seeds(), horizon=st.integers(1, 15), discount=st.sampled_from([GAMMA, 1.0]))
     def _(seed: int, horizon: int, discount: float) -> None:
         continue_ = imagined(run, seed, horizon)[1]
-        run.expect("cumulative_weights", (continue_, discount), reference.cumulative_weights(continue_, discount), bound=64 * run.u)
+        run.expect(
+            "cumulative_weights",
+            (continue_, discount),
+            reference.cumulative_weights(continue_, discount),
+            bound=64 * run.u,
+        )
 
 
 @check("RET-8", uses=["cumulative_weights"], level=0)
@@ -95,7 +114,11 @@ def replay_return_literals(run: Run) -> None:
     is_terminal = np.zeros((3, 5), bool)
     is_last[1:, 2] = is_terminal[2, 2] = True
     expected = np.array([[3.09375, 4.375, 3.5, 4], [3.25, 5, 3.5, 4], [2.5, 2, 3.5, 4]])
-    run.exact("replay_lambda_return", run.call("replay_lambda_return", reward, is_last, is_terminal, annotation, 0.5, 0.5), expected)
+    run.exact(
+        "replay_lambda_return",
+        run.call("replay_lambda_return", reward, is_last, is_terminal, annotation, 0.5, 0.5),
+        expected,
+    )
     one = (array[:, :1] for array in (reward, is_last, is_terminal, annotation))
     run.exact("one step has no return", run.call("replay_lambda_return", *one, 0.5, 0.5), np.zeros((3, 0)))
 
@@ -107,7 +130,10 @@ def replay_return_matches(run: Run) -> None:
     @run.for_all(seed=seeds(), length=st.integers(2, 20))
     def _(seed: int, length: int) -> None:
         reward, is_last, is_terminal, annotation = replayed(run, seed, length)
-        magnitude = reference.replay_lambda_return(np.abs(reward), is_last, is_terminal, np.abs(annotation), GAMMA, 0.95) + run.tiny
+        magnitude = (
+            reference.replay_lambda_return(np.abs(reward), is_last, is_terminal, np.abs(annotation), GAMMA, 0.95)
+            + run.tiny
+        )
         expected = reference.replay_lambda_return(reward, is_last, is_terminal, annotation, GAMMA, 0.95)
         arguments = (reward, is_last, is_terminal, annotation, GAMMA, 0.95)
         run.expect("replay_lambda_return", arguments, expected, magnitude=magnitude, bound=64 * run.u)
@@ -144,7 +170,9 @@ def percentile_matches(run: Run) -> None:
     @run.for_all(seed=seeds(), count=st.integers(1, 300), q=st.floats(0, 100))
     def _(seed: int, count: int, q: float) -> None:
         values = run.cast(np.random.default_rng(seed).normal(size=(count, 2)))
-        run.expect("percentile", (values, q), reference.percentile(values, q), magnitude=np.abs(values).max(), bound=64 * run.u)
+        run.expect(
+            "percentile", (values, q), reference.percentile(values, q), magnitude=np.abs(values).max(), bound=64 * run.u
+        )
 
 
 @check("RET-13", uses=["percentile"], level=0)
@@ -162,7 +190,9 @@ def return_range_literals(run: Run) -> None:
     config = small_config(run.profile)
     returns = np.array([[16.0, 1, 4, 2, 8]])
     run.expect("update_return_range", (0.0, 0.0, returns, config), (0.012, 0.144), bound=64 * run.u)
-    run.expect("update_return_range", (-1.0, 3.0, returns, config), (0.99 * -1 + 0.012, 0.99 * 3 + 0.144), bound=64 * run.u)
+    run.expect(
+        "update_return_range", (-1.0, 3.0, returns, config), (0.99 * -1 + 0.012, 0.99 * 3 + 0.144), bound=64 * run.u
+    )
 
 
 @check("RET-14", uses=["update_return_range"], level=0)
@@ -177,7 +207,12 @@ def return_range_matches(run: Run) -> None:
 @check("RET-16", uses=["return_scale"], level=0)
 def return_scale_literals(run: Run) -> None:
     """The scale is high - low, but never below the limit; NaN shows."""
-    for low, high, limit, expected in ((0.0, 0.5, 1.0, 1.0), (-2.0, 3.0, 1.0, 5.0), (3.0, -2.0, 1.0, 1.0), (0.0, 0.5, 0.25, 0.5)):
+    for low, high, limit, expected in (
+        (0.0, 0.5, 1.0, 1.0),
+        (-2.0, 3.0, 1.0, 5.0),
+        (3.0, -2.0, 1.0, 1.0),
+        (0.0, 0.5, 0.25, 0.5),
+    ):
         run.exact("return_scale", run.call("return_scale", low, high, limit), expected)
     run.exact("NaN", run.call("return_scale", np.nan, 1.0, 1.0), np.nan)
 
@@ -189,7 +224,11 @@ def returns_do_not_hide_nan(run: Run) -> None:
     value[0, 3] = np.nan
     run.exact("lambda_return", run.call("lambda_return", reward, continue_, value, 0.5, 0.5), np.full((1, 3), np.nan))
     ends = np.ones((1, 4), bool)
-    run.exact("replay_lambda_return", run.call("replay_lambda_return", reward, ends, ends, value, 0.5, 0.5), np.full((1, 3), np.nan))
+    run.exact(
+        "replay_lambda_return",
+        run.call("replay_lambda_return", reward, ends, ends, value, 0.5, 0.5),
+        np.full((1, 3), np.nan),
+    )
     continue_[0, 1] = np.nan
     run.exact("cumulative_weights", run.call("cumulative_weights", continue_, 0.5), np.array([[0, np.nan, np.nan]]))
 

@@ -16,9 +16,19 @@ from spec import Config, Spaces, parameter_table
 TASK = spaces("vector", "mixed")
 ROWS, STEPS, HORIZON = 3, 5, 4
 # Other depths, sizes and mixture than those of the profiles: 2 blocks of 6 memory units instead of 8 blocks of 2.
-UNUSUAL = {"deter": 12, "blocks": 2, "units": 6, "prior_layers": 3, "posterior_layers": 2, "latent_unimix": 0.5, "norm_epsilon": 0.1}
+UNUSUAL = {
+    "deter": 12,
+    "blocks": 2,
+    "units": 6,
+    "prior_layers": 3,
+    "posterior_layers": 2,
+    "latent_unimix": 0.5,
+    "norm_epsilon": 0.1,
+}
 SIZES = st.sampled_from([{}, UNUSUAL])
-FRACTION = np.array([[0.251, 0.251, 0.251, 0.0], [0.253, 0.744, 0.499, 0.006], [0.0, 0.753, 0.501, 0.0], [1 - 2.0**-24] * 4])
+FRACTION = np.array(
+    [[0.251, 0.251, 0.251, 0.0], [0.253, 0.744, 0.499, 0.006], [0.0, 0.753, 0.501, 0.0], [1 - 2.0**-24] * 4]
+)
 LATENTS = np.array([[0.0, math.log(3.0)], [math.log(3.0), 0.0], [0.0, 0.0], [-131072.0, 0.0]])
 
 
@@ -72,18 +82,23 @@ def imagine_arguments(run: Run, seed: int, config: Config) -> tuple[Any, ...]:
     return params, carry, action, uniform, config
 
 
-def reference_imagine(params: Any, carry: Any, action: np.ndarray, uniform: np.ndarray, config: Config) -> dict[str, np.ndarray]:
+def reference_imagine(
+    params: Any, carry: Any, action: np.ndarray, uniform: np.ndarray, config: Config
+) -> dict[str, np.ndarray]:
     return reference.imagine(params, carry, lambda feature, t: action[:, t], uniform, config)
 
 
 @check("RSSM-7", uses=["core"], level=1)
 def gates_literals(run: Run) -> None:
-    """Memories 0.2, -0.5 and 1 with gate inputs (0, 1, 1), (1, 2, 0) and (0, 0, 0) become 0.331059, -0.124003 and 0.731059."""
+    """Memories 0.2, -0.5 and 1 with gate inputs (0, 1, 1), (1, 2, 0) and (0, 0, 0) become 0.331059, -0.124003 and
+    0.731059."""
     config = small_config(run.profile, run.dtype, deter=3, blocks=1)
     params = zero_parameters(config) | {"rssm/gru/bias": np.array([0.0, 1, 0, 1, 2, 0, 1, 0, 0])}
     inputs = run.cast([[0.2, -0.5, 1.0]]), np.zeros((1, config.stoch, config.classes)), np.zeros((1, TASK.action_size))
     expected = np.array([[0.331059, -0.124003, 0.731059]])
-    run.expect("core", (params, *inputs, config), expected, magnitude=1.0, bound=2e-2 if run.dtype == "bfloat16" else 2e-6)
+    run.expect(
+        "core", (params, *inputs, config), expected, magnitude=1.0, bound=2e-2 if run.dtype == "bfloat16" else 2e-6
+    )
 
 
 @check("RSSM-6", uses=["core"], level=1)
@@ -98,13 +113,20 @@ def gates_are_split_inside_each_block(run: Run) -> None:
 
 @check("RSSM-3", "RSSM-4", "RSSM-5", uses=["core"], level=1)
 def inputs_of_the_blocks(run: Run) -> None:
-    """The blocks read (1, 2, 7, 8, 9) and (3, 4, 7, 8, 9): their memory, then all embeddings; RMSNorm runs over both blocks together."""
+    """The blocks read (1, 2, 7, 8, 9) and (3, 4, 7, 8, 9): their memory, then all embeddings; RMSNorm runs over both
+    blocks together."""
     config = small_config(run.profile, run.dtype, deter=4, blocks=2, units=1, norm_epsilon=1e-20)
     params = zero_parameters(config) | {"rssm/hidden/scale": np.ones(4), "rssm/hidden/bias": np.array([0.0, 8, 0, 8])}
-    for name, scale in (("deter", 7.0), ("stoch", 8.0), ("action", 9.0)):  # one unit: RMSNorm leaves the sign of the bias times the scale
+    for name, scale in (
+        ("deter", 7.0),
+        ("stoch", 8.0),
+        ("action", 9.0),
+    ):  # one unit: RMSNorm leaves the sign of the bias times the scale
         params |= {f"rssm/embed_{name}/bias": np.ones(1), f"rssm/embed_{name}/scale": np.array([scale])}
     params["rssm/gru/bias"] = np.array([100.0, 100, 0, 0, 100, 100] * 2)
-    params["rssm/gru/kernel"][:, 0, 2] = 1  # the candidate of each block's first unit reads the block's first hidden unit
+    params["rssm/gru/kernel"][:, 0, 2] = (
+        1  # the candidate of each block's first unit reads the block's first hidden unit
+    )
     inputs = np.array([[1.0, 2, 3, 4]]), np.zeros((1, config.stoch, config.classes)), np.zeros((1, TASK.action_size))
     embeddings = [x / (1 + math.exp(-x)) for x in (7, 8, 9)]
     for index, (first, second) in enumerate(zip([1, 2, *embeddings], [3, 4, *embeddings], strict=True)):
@@ -145,13 +167,18 @@ def large_actions_count_as_one(run: Run) -> None:
 
 @check("RSSM-8", "RSSM-9", "RSSM-10", "RSSM-26", uses=["prior", "posterior"], level=1)
 def logits_literals(run: Run) -> None:
-    """With zero weights the logits are the biases of the output layer, row by row, before any mixture or normalization."""
+    """With zero weights the logits are the biases of the output layer, row by row, before any mixture or
+    normalization."""
     config = small_config(run.profile, run.dtype)
     bias = np.arange(15.0) * 16
     params = zero_parameters(config) | {"rssm/prior/out/bias": bias, "rssm/posterior/out/bias": -bias}
     expected = np.tile(bias.reshape(3, 5), (2, 1, 1))
     run.exact("prior", run.call("prior", params, np.ones((2, config.deter)), config), expected)
-    run.exact("posterior", run.call("posterior", params, np.ones((2, config.deter)), np.ones((2, config.units)), config), -expected)
+    run.exact(
+        "posterior",
+        run.call("posterior", params, np.ones((2, config.deter)), np.ones((2, config.units)), config),
+        -expected,
+    )
 
 
 @check("RSSM-8", "RSSM-9", "RSSM-10", "RSSM-26", uses=["prior", "posterior"], level=1)
@@ -187,7 +214,8 @@ def leading_axes(run: Run) -> None:
 
 
 def sample_both(run: Run, config: Config, logits: np.ndarray, uniform: np.ndarray, expected: np.ndarray) -> None:
-    """Samples of posterior and prior, whose logits [S, C] are given as biases: the classes [N, S] must be as expected."""
+    """Samples of posterior and prior, whose logits [S, C] are given as biases: the classes [N, S] must be as
+    expected."""
     bias = logits.reshape(-1)
     params = zero_parameters(config) | {"rssm/prior/out/bias": bias, "rssm/posterior/out/bias": bias}
     rows, onehot = len(uniform), np.eye(config.classes)[expected]
@@ -202,8 +230,11 @@ def sample_both(run: Run, config: Config, logits: np.ndarray, uniform: np.ndarra
 
 @check("RSSM-10", "RSSM-11", "RSSM-12", uses=["observe", "imagine"], level=1)
 def sampling_literals(run: Run) -> None:
-    """Probabilities (1/4, 3/4) give class 0 at 0.251 with one percent of uniform mixture and class 1 without; 0 and almost 1."""
-    logits = round_to(LATENTS, "bfloat16")  # so that every dtype holds them: 0.2495 instead of 0.25, and likewise with 0.7505
+    """Probabilities (1/4, 3/4) give class 0 at 0.251 with one percent of uniform mixture and class 1 without; 0 and
+    almost 1."""
+    logits = round_to(
+        LATENTS, "bfloat16"
+    )  # so that every dtype holds them: 0.2495 instead of 0.25, and likewise with 0.7505
     mixed = small_config(run.profile, run.dtype, stoch=4, classes=2, latent_unimix=0.01)
     sample_both(run, mixed, logits, FRACTION, np.array([[0, 0, 0, 0], [1, 0, 0, 1], [0, 1, 1, 0], [1, 1, 1, 1]]))
     plain = small_config(run.profile, run.dtype, stoch=4, classes=2, latent_unimix=0.0)
@@ -212,7 +243,8 @@ def sampling_literals(run: Run) -> None:
 
 @check("RSSM-10", "RSSM-11", "RSSM-12", "RSSM-26", "CON-17", uses=["observe", "imagine"], level=1)
 def sampling_near_boundaries(run: Run) -> None:
-    """Uniform numbers just below and above where a class begins, or just below 1: sums of probabilities are at least float32."""
+    """Uniform numbers just below and above where a class begins, or just below 1: sums of probabilities are at least
+    float32."""
     config = small_config(run.profile, run.dtype)
     distance = 1e-9 if run.dtype == "float64" else 1e-5
 
@@ -242,7 +274,8 @@ def observe_matches(run: Run) -> None:
 
 @check("RSSM-13", "RSSM-14", "RSSM-17", "CON-12", uses=["observe"], level=1)
 def resets_forget_everything(run: Run) -> None:
-    """Nothing before a reset changes anything from it on, not even as NaN or infinity; rows without a reset notice nothing."""
+    """Nothing before a reset changes anything from it on, not even as NaN or infinity; rows without a reset notice
+    nothing."""
     config = small_config(run.profile, run.dtype)
     is_first = np.zeros((ROWS, STEPS), bool)
     is_first[0, 0] = is_first[1, 2] = True
@@ -264,7 +297,8 @@ def resets_forget_everything(run: Run) -> None:
 
 @check("RSSM-13", "RSSM-15", "CON-5", uses=["observe"], level=1)
 def a_reset_is_a_start_from_zeros(run: Run) -> None:
-    """A reset at the first step equals, in every bit, no reset with zeros for memory, latents and the whole previous action."""
+    """A reset at the first step equals, in every bit, no reset with zeros for memory, latents and the whole previous
+    action."""
     config = small_config(run.profile, run.dtype)
     is_first = np.zeros((ROWS, STEPS), bool)
     is_first[:, 0] = True
@@ -280,7 +314,8 @@ def a_reset_is_a_start_from_zeros(run: Run) -> None:
 
 @check("RSSM-2", "RSSM-10", "RSSM-11", "RSSM-20", "RSSM-21", "RSSM-22", uses=["imagine"], level=1)
 def imagine_matches(run: Run) -> None:
-    """Trajectories under given actions: the start unchanged, samples of the prior fed back, actions as they were given."""
+    """Trajectories under given actions: the start unchanged, samples of the prior fed back, actions as they were
+    given."""
 
     @run.for_all(seed=seeds(), sizes=SIZES)
     def _(seed: int, sizes: dict[str, Any]) -> None:
@@ -308,7 +343,8 @@ def memory_is_rounded_at_every_step(run: Run) -> None:
 
 @check("RSSM-27", "CON-8", uses=["core", "prior", "posterior"], level=1)
 def steps_refuse_shapes(run: Run) -> None:
-    """Wrong sizes are refused, with name and shape; and different numbers of rows, also where they could be broadcast."""
+    """Wrong sizes are refused, with name and shape; and different numbers of rows, also where they could be
+    broadcast."""
     config = small_config(run.profile, run.dtype)
     D, S, C, A, E = config.deter, config.stoch, config.classes, TASK.action_size, config.units
     params = random_parameters(run.rng(), config, TASK, run.dtype)
@@ -320,7 +356,9 @@ def steps_refuse_shapes(run: Run) -> None:
         ("action", (3, A - 1)),
     )
     for name, wrong in sizes:
-        run.refuses("core", params, *map(np.zeros, (good | {name: wrong}).values()), config, naming=[name, listed(wrong)])
+        run.refuses(
+            "core", params, *map(np.zeros, (good | {name: wrong}).values()), config, naming=[name, listed(wrong)]
+        )
     rows: tuple[tuple[str, tuple[int, ...]], ...] = (
         ("deter", (1, D)), ("stoch", (1, S, C)), ("action", (1, A)), ("action", (A,)), ("action", (4, A)),
     )  # fmt: skip
@@ -342,10 +380,24 @@ def listed(shape: tuple[int, ...]) -> str:
 def sequences_refuse_shapes(run: Run) -> None:
     """Wrong sizes are refused by name; and different numbers of rows or steps, also where they could be broadcast."""
     config = small_config(run.profile, run.dtype)
-    B, T, H, D, S, C, A, E = ROWS, STEPS, HORIZON, config.deter, config.stoch, config.classes, TASK.action_size, config.units
+    B, T, H, D, S, C, A, E = (
+        ROWS,
+        STEPS,
+        HORIZON,
+        config.deter,
+        config.stoch,
+        config.classes,
+        TASK.action_size,
+        config.units,
+    )
     params, carry, tokens, prev_action, is_first, uniform, _ = observe_arguments(run, run.seed, config)
     good = {"carry": carry, "tokens": tokens, "prev_action": prev_action, "is_first": is_first, "uniform": uniform}
-    for name, wrong in (("tokens", (B, T, E + 1)), ("prev_action", (B, T, A - 1)), ("uniform", (B, T, S + 1)), ("uniform", (B, T, 1))):
+    for name, wrong in (
+        ("tokens", (B, T, E + 1)),
+        ("prev_action", (B, T, A - 1)),
+        ("uniform", (B, T, S + 1)),
+        ("uniform", (B, T, 1)),
+    ):
         run.refuses("observe", params, *(good | {name: np.zeros(wrong)}).values(), config, naming=[name])
     lengths: dict[str, list[tuple[int, ...]]] = {
         "tokens": [(B, T - 1, E), (1, T, E), (B, E)],
@@ -358,7 +410,10 @@ def sequences_refuse_shapes(run: Run) -> None:
             array = np.zeros(shape, bool if name == "is_first" else float)
             run.refuses("observe", params, *(good | {name: array}).values(), config)
     action, uniform = np.zeros((B, H, A)), np.zeros((B, H, S))
-    carries: dict[str, list[tuple[int, ...]]] = {"deter": [(B, D - 1), (1, D)], "stoch": [(B, S * C), (B, C, S), (1, S, C)]}
+    carries: dict[str, list[tuple[int, ...]]] = {
+        "deter": [(B, D - 1), (1, D)],
+        "stoch": [(B, S * C), (B, C, S), (1, S, C)],
+    }
     for name, shapes in carries.items():
         for shape in shapes:
             changed, naming = carry | {name: np.zeros(shape)}, [name, listed(shape)] if shape[0] == B else []

@@ -1,7 +1,7 @@
 """Checks of samples that an implementation draws with a generator of its own: the functions named `draw_...`.
 
-They are statistical. All of them together are wrong about a right sampler with a probability of at most 1e-6 in a run: see
-conformance/statistics.py, which counts these checks.
+They are statistical. All of them together are wrong about a right sampler with a probability of at most 1e-6 in a run:
+see conformance/statistics.py, which counts these checks.
 """
 
 import itertools
@@ -45,7 +45,12 @@ def latents_have_their_frequencies(run: Run) -> None:
         drawn = np.asarray(run.call("draw_categorical", LATENTS, unimix, seed, SAMPLES), np.float64)
         require_onehots(run, "samples", drawn, (SAMPLES, *LATENTS.shape))
         probs = np.exp(unimix_log_probs(LATENTS, unimix))
-        compare_groups(run, f"unimix {unimix}: ", {f"latent {i}": (drawn[:, i], probs[i]) for i in range(len(probs))}, confidence(tests))
+        compare_groups(
+            run,
+            f"unimix {unimix}: ",
+            {f"latent {i}": (drawn[:, i], probs[i]) for i in range(len(probs))},
+            confidence(tests),
+        )
     other = run.call("draw_categorical", LATENTS, UNIMIX, 2 * run.seed + 2, SAMPLES)
     run.holds("another seed gives other samples", not np.array_equal(drawn, other))
 
@@ -67,15 +72,21 @@ def normals_have_their_distribution(run: Run) -> None:
 
 @check("BEH-1", "BEH-2", "BEH-4", "CON-26", "CON-27", uses=["draw_actions"], level=1, dtypes=EXACT)
 def actions_have_their_distribution(run: Run) -> None:
-    """Categoricals with their uniform share, normals neither clipped nor squashed, neighbours independent, in the order of the keys."""
+    """Categoricals with their uniform share, normals neither clipped nor squashed, neighbours independent, in the order
+    of the keys."""
     config, task = small_config(run.profile, run.dtype, actor_unimix=UNIMIX), spaces(action="mixed")
-    outputs = {"arm": {"mean": np.array([0.9, -0.3]), "std": np.array([1.0, -3.0])}, "buttons": {"logits": np.array([0.0, -9, 1, 2, -9])}}
+    outputs = {
+        "arm": {"mean": np.array([0.9, -0.3]), "std": np.array([1.0, -3.0])},
+        "buttons": {"logits": np.array([0.0, -9, 1, 2, -9])},
+    }
     tests = 3 * 2 + tests_of([2, 2, 2, 3])
     drawn = np.asarray(run.call("draw_actions", outputs, task, config, run.seed, SAMPLES), np.float64)
     require_shape(run, "samples", drawn, (SAMPLES, task.action_size))
 
     groups: dict[str, Group] = {}
-    means, stds = bounded_normal(outputs["arm"]["mean"], outputs["arm"]["std"], config.actor_min_std, config.actor_max_std)
+    means, stds = bounded_normal(
+        outputs["arm"]["mean"], outputs["arm"]["std"], config.actor_min_std, config.actor_max_std
+    )
     for i in range(2):
         z = (drawn[:, i] - means[i]) / stds[i]
         compare_normal(run, f"arm {i}", z, confidence(tests))
@@ -89,13 +100,18 @@ def actions_have_their_distribution(run: Run) -> None:
 
 @check("AGT-1", "AGT-3", "AGT-4", "AGT-5", "AGT-6", "LAY-9", "LAY-10", uses=["draw_parameters"], level=1, dtypes=EXACT)
 def parameters_have_their_distribution(run: Run) -> None:
-    """Names and shapes of the table; exact zeros and ones; kernels follow the truncated normal, each by itself and all together."""
+    """Names and shapes of the table; exact zeros and ones; kernels follow the truncated normal, each by itself and all
+    together."""
     task = spaces()
-    config = small_config(run.profile, run.dtype, units=48, deter=96, cnn_depth=4, actor_outscale=0.01, reward_outscale=0.0)
+    config = small_config(
+        run.profile, run.dtype, units=48, deter=96, cnn_depth=4, actor_outscale=0.01, reward_outscale=0.0
+    )
     table = parameter_table(config, task)
     params = run.call("draw_parameters", task, config, run.seed)
     run.holds("the names are those of the parameter table", set(params) == set(table))
-    random = {name: entry for name, entry in table.items() if entry.initializer == "truncated_normal" and entry.outscale}
+    random = {
+        name: entry for name, entry in table.items() if entry.initializer == "truncated_normal" and entry.outscale
+    }
     level = confidence(2 * len(random) + 1)
     weights = []
     for name, entry in table.items():
@@ -143,13 +159,23 @@ def compare_groups(run: Run, where: str, groups: dict[str, Group], level: float)
         within(run, f"{where}frequencies of {label}", onehot.mean(0), probs, frequency_radius(probs, SAMPLES, level))
     for (a, (left, p)), (b, (right, q)) in itertools.pairwise(groups.items()):
         both = np.outer(p, q)
-        within(run, f"{where}{a} together with {b}", left.T @ right / SAMPLES, both, frequency_radius(both, SAMPLES, level))
+        within(
+            run, f"{where}{a} together with {b}", left.T @ right / SAMPLES, both, frequency_radius(both, SAMPLES, level)
+        )
 
 
 def compare_normal(run: Run, where: str, z: np.ndarray, level: float) -> None:
     within(run, f"{where}: mean in standard deviations", z.mean(), 0.0, normal_mean_radius(SAMPLES, level))
-    within(run, f"{where}: mean square in units of the variance", np.mean(z**2), 1.0, normal_square_radius(SAMPLES, level))
-    within(run, f"{where}: distance of distributions", distribution_distance(z, normal_cdf), 0.0, distribution_radius(SAMPLES, level))
+    within(
+        run, f"{where}: mean square in units of the variance", np.mean(z**2), 1.0, normal_square_radius(SAMPLES, level)
+    )
+    within(
+        run,
+        f"{where}: distance of distributions",
+        distribution_distance(z, normal_cdf),
+        0.0,
+        distribution_radius(SAMPLES, level),
+    )
 
 
 def signs(z: np.ndarray) -> Group:

@@ -1,4 +1,5 @@
-"""Checks of spec/12-training-loop.md: what a training loop must compute exactly. What only a running loop shows is tested in tests/."""
+"""Checks of spec/12-training-loop.md: what a training loop must compute exactly. What only a running loop shows is
+tested in tests/."""
 
 import hashlib
 import json
@@ -33,7 +34,8 @@ def train_steps_by_hand(run: Run) -> None:
 
 @check("LOOP-14", "LOOP-15", uses=["ReplayRatio"], level=0)
 def train_steps_do_not_drift(run: Run) -> None:
-    """After any steps the sum is 1 + floor((t - t0) ratio / batch steps) with the exact value of the ratio's float64."""
+    """After any steps the sum is 1 + floor((t - t0) ratio / batch steps) with the exact value of the ratio's
+    float64."""
 
     @run.for_all(
         ratio=st.one_of(st.sampled_from([0.1, 0.3, 1 / 3, 7.3, 1e-7, 512.0]), st.floats(1e-3, 1e4)),
@@ -50,7 +52,8 @@ def train_steps_do_not_drift(run: Run) -> None:
 
 @check("LOOP-16", uses=["ReplayRatio"], level=0)
 def no_training_and_no_way_back(run: Run) -> None:
-    """A ratio of 0 never trains, not even at the first call; a step smaller than the remembered one is refused with any ratio."""
+    """A ratio of 0 never trains, not even at the first call; a step smaller than the remembered one is refused with any
+    ratio."""
     never = run.call("ReplayRatio", 0.0, 1024)
     run.exact("ratio 0", [never(step) for step in (0, 1, 2000, 10**7)], [0, 0, 0, 0])
     run.holds("ratio 0 remembers no step", never.state_dict()["step"] is None)
@@ -74,7 +77,10 @@ def a_pause_is_never_paid_for(run: Run) -> None:
     paused = run.call("ReplayRatio", 0.0, 1024)
     paused.load_state_dict(json.loads(json.dumps(paying.state_dict())))
     run.exact("the pause", [paused(step) for step in (1000, 5000, 200_000)], [0, 0, 0])
-    run.holds(f"{paused.state_dict()} is step 200000, credit 1000", dict(paused.state_dict()) == {"step": 200_000, "credit": "1000"})
+    run.holds(
+        f"{paused.state_dict()} is step 200000, credit 1000",
+        dict(paused.state_dict()) == {"step": 200_000, "credit": "1000"},
+    )
     paying.load_state_dict(json.loads(json.dumps(paused.state_dict())))
     run.exact("after it", [paying(step) for step in (200_000, 200_023, 200_024, 201_047, 201_048)], [0, 0, 1, 0, 1])
     large = run.call("ReplayRatio", 0.0, 4)
@@ -84,11 +90,14 @@ def a_pause_is_never_paid_for(run: Run) -> None:
 
 @check("LOOP-21", "LOOP-23", uses=["ReplayRatio"], level=0)
 def the_replay_ratio_goes_on(run: Run) -> None:
-    """Its state is exact and survives JSON; a loaded counter goes on as the saved one does, without another first train step."""
+    """Its state is exact and survives JSON; a loaded counter goes on as the saved one does, without another first train
+    step."""
     counter = run.call("ReplayRatio", 0.5, 4)
     run.holds("no step before the first call", counter.state_dict()["step"] is None)
     counter(100), counter(107)
-    run.holds(f"{counter.state_dict()} is step 107, credit 7/2", dict(counter.state_dict()) == {"step": 107, "credit": "7/2"})
+    run.holds(
+        f"{counter.state_dict()} is step 107, credit 7/2", dict(counter.state_dict()) == {"step": 107, "credit": "7/2"}
+    )
 
     @run.for_all(ratio=st.sampled_from([0.3, 0.1, 32.0]), calls=st.integers(0, 5), later=st.sampled_from([0.3, 5.0]))
     def _(ratio: float, calls: int, later: float) -> None:
@@ -119,13 +128,16 @@ def training_starts_with_enough_items(run: Run) -> None:
     for items in (0, 14, 15):
         run.refuses("can_train", items, small_config(run.profile, batch_size=3, batch_length=5, replay_capacity=14))
     run.exact(
-        "just enough", bool(run.call("can_train", 15, small_config(run.profile, batch_size=3, batch_length=5, replay_capacity=15))), True
+        "just enough",
+        bool(run.call("can_train", 15, small_config(run.profile, batch_size=3, batch_length=5, replay_capacity=15))),
+        True,
     )
 
 
 @check("LOOP-12", "CON-27", uses=["environment_action"], level=0)
 def environment_actions_by_hand(run: Run) -> None:
-    """Indices of choices, numbers clipped and scaled to the bounds, to a range 2 wide at a single one, as they are where there is none."""
+    """Indices of choices, numbers clipped and scaled to the bounds, to a range 2 wide at a single one, as they are
+    where there is none."""
     low, high = {"turn": np.array([0, -np.inf, 0, -2])}, {"turn": np.array([10, np.inf, np.inf, 2])}
     flat = np.array([0, 1, 0, 0, 1, 0.5, -1.7, -0.25, 1.7])  # keys in sorted order: buttons, turn
     result = run.call("environment_action", flat, TASK, low, high)
@@ -148,7 +160,9 @@ def environment_actions_by_hand(run: Run) -> None:
         (1.7, -0.25, np.inf, 1.75),
     ):
         bounds = {"a": np.array([bottom])}, {"a": np.array([top])}
-        run.expect("environment_action", (np.array([number]), one, *bounds), {"a": np.array([expected])}, bound=4 * run.u)
+        run.expect(
+            "environment_action", (np.array([number]), one, *bounds), {"a": np.array([expected])}, bound=4 * run.u
+        )
     batch = run.call("environment_action", np.stack([[flat, ties, flat], [ties, flat, flat]]), TASK, low, high)
     run.exact("buttons of a batch", batch["buttons"], [[[1, 2], [0, 1], [1, 2]], [[0, 1], [1, 2], [1, 2]]])
     run.exact("turn of a batch", batch["turn"][1, 2], [7.5, -1, 0.75, 2])
@@ -156,7 +170,8 @@ def environment_actions_by_hand(run: Run) -> None:
 
 @check("LOOP-12", uses=["environment_action"], level=0)
 def environment_actions_stay_within_bounds(run: Run) -> None:
-    """Whatever is sampled, the environment gets low + (a + 1) / 2 (high - low) of the clipped number, never outside the bounds."""
+    """Whatever is sampled, the environment gets low + (a + 1) / 2 (high - low) of the clipped number, never outside the
+    bounds."""
     one = Spaces({"x": Vector(1)}, {"a": Vector(5)})
 
     @run.for_all(seed=seeds(), scale=st.sampled_from([0.1, 1.0, 100.0]), size=st.sampled_from([1e-3, 1.0, 1e6]))
@@ -201,10 +216,26 @@ def flags_by_hand(run: Run) -> None:
             run.expect("step_flags", arguments, expected, bound=1e-9)
 
 
-@check("LOOP-3", "LOOP-9", "LOOP-10", "CON-9", "CON-10", "CON-27", "REP-6", "REP-19", uses=["make_record", "step_flags"], level=0)
+@check(
+    "LOOP-3",
+    "LOOP-9",
+    "LOOP-10",
+    "CON-9",
+    "CON-10",
+    "CON-27",
+    "REP-6",
+    "REP-19",
+    uses=["make_record", "step_flags"],
+    level=0,
+)
 def records_by_hand(run: Run) -> None:
-    """A record holds what arrived, the raw action and the latents as indices; no reward at a reset, no action at an end; copies."""
-    x, action, deter = np.array([4.0], np.float32), np.array([1.75, -3.0], np.float32), np.array([0.5, 0.25], np.float32)
+    """A record holds what arrived, the raw action and the latents as indices; no reward at a reset, no action at an
+    end; copies."""
+    x, action, deter = (
+        np.array([4.0], np.float32),
+        np.array([1.75, -3.0], np.float32),
+        np.array([0.5, 0.25], np.float32),
+    )
     stoch = np.eye(3)[[2, 0]]
     plain: dict[str, Any] = {"x": [4], "reward": 2.5, "action": [1.75, -3], "deter": [0.5, 0.25], "stoch": [2, 0]}
     for flags, changes in (
@@ -218,7 +249,13 @@ def records_by_hand(run: Run) -> None:
         run.holds(f"the keys {sorted(made)}", set(made) == {*plain, *step})
         for key, value in {**plain, **step, **changes}.items():
             run.exact(f"{key} with the flags {flags}", made[key], value)
-        for key, dtype in {"reward": "float32", "action": "float32", "deter": "float32", "is_first": "bool", "is_last": "bool"}.items():
+        for key, dtype in {
+            "reward": "float32",
+            "action": "float32",
+            "deter": "float32",
+            "is_first": "bool",
+            "is_last": "bool",
+        }.items():
             run.holds(f"{key} is {dtype}", made[key].dtype == dtype)
         run.holds("stoch holds integers", made["stoch"].dtype.kind in "iu")
     made = run.call("make_record", {"x": x}, 2.5, run.call("step_flags", False, False, False), action, deter, stoch)
@@ -238,7 +275,11 @@ def seeds_by_hand(run: Run) -> None:
     ):
         run.exact(f"derive_seed({seed}, {purpose}, {index})", run.call("derive_seed", seed, purpose, index), expected)
 
-    @run.for_all(seed=st.integers(0, 2**40), purpose=st.sampled_from(["policy", "replay", "evaluation"]), index=st.integers(0, 2**40))
+    @run.for_all(
+        seed=st.integers(0, 2**40),
+        purpose=st.sampled_from(["policy", "replay", "evaluation"]),
+        index=st.integers(0, 2**40),
+    )
     def _(seed: int, purpose: str, index: int) -> None:
         first = hashlib.sha256(f"{seed}/{purpose}/{index}".encode()).digest()[:4]
         expected = (first[0] & 127) << 24 | first[1] << 16 | first[2] << 8 | first[3]

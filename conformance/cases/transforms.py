@@ -74,7 +74,9 @@ def bins_literals(run: Run) -> None:
     five = [-485165194.4097903, -22025.465794806718, 0.0, 22025.465794806718, 485165194.4097903]
     run.expect("exponential_bins", (5,), np.array(five), bound=1e-12)
     bins = np.asarray(run.expect("exponential_bins", (255,), reference.exponential_bins(255), bound=1e-12))
-    run.compare("bins 127 to 129", bins[127:130], np.array([0.0, 0.17055771862604, 0.37020536395145]), magnitude=1.0, bound=1e-8)
+    run.compare(
+        "bins 127 to 129", bins[127:130], np.array([0.0, 0.17055771862604, 0.37020536395145]), magnitude=1.0, bound=1e-8
+    )
     run.holds("bins are float64", bins.dtype == np.float64)
     run.exact("bins are antisymmetric", bins[::-1], -bins)
     run.holds("bins increase", np.diff(bins) > 0)
@@ -97,7 +99,8 @@ def the_fewest_bins(run: Run) -> None:
 
 @check("TRA-7", "TRA-8", uses=["twohot"], level=0)
 def twohot_literals(run: Run) -> None:
-    """Over the bins -3, -1, 0, 1, 3: 2 is [0,0,0,.5,.5], -.25 is [0,.25,.75,0,0], a bin is itself, 7 is the last bin."""
+    """Over the bins -3, -1, 0, 1, 3: 2 is [0,0,0,.5,.5], -.25 is [0,.25,.75,0,0], a bin is itself, 7 is the last
+    bin."""
     x = np.array([2.0, -0.25, 1.0, 7.0, -3.0, -0.0, -9.0])
     expected = np.zeros((7, 5))
     expected[0, 3:] = 0.5
@@ -107,14 +110,23 @@ def twohot_literals(run: Run) -> None:
     weights = np.zeros((2, 255))
     weights[0, 127:129] = 0.4136882, 0.5863118
     weights[1, 163:165] = 0.774017, 0.225983
-    run.expect("twohot", (run.cast([0.1, 300.0]), held_bins(run)), weights, magnitude=1.0, bound=1e-5 if run.dtype != "bfloat16" else 1e-2)
+    run.expect(
+        "twohot",
+        (run.cast([0.1, 300.0]), held_bins(run)),
+        weights,
+        magnitude=1.0,
+        bound=1e-5 if run.dtype != "bfloat16" else 1e-2,
+    )
 
 
 @check("TRA-7", "TRA-8", "TRA-9", "TRA-14", uses=["twohot"], level=0)
 def twohot_matches(run: Run) -> None:
-    """Weights agree on bin edges and their neighbours, huge and non-finite numbers; other entries are exactly 0; the sum is 1."""
+    """Weights agree on bin edges and their neighbours, huge and non-finite numbers; other entries are exactly 0; the
+    sum is 1."""
     bins = held_bins(run)
-    edges = st.integers(0, 254).flatmap(lambda k: st.sampled_from([bins[k], np.nextafter(bins[k], -np.inf), np.nextafter(bins[k], np.inf)]))
+    edges = st.integers(0, 254).flatmap(
+        lambda k: st.sampled_from([bins[k], np.nextafter(bins[k], -np.inf), np.nextafter(bins[k], np.inf)])
+    )
 
     @run.for_all(x=shapes().flatmap(lambda shape: arrays(st.one_of(adversarial_numbers(), edges), shape)))
     def _(x: np.ndarray) -> None:
@@ -150,16 +162,27 @@ def expectation_matches(run: Run) -> None:
         bins = held_bins(run)
         logits = normals(seed, *shape, 255, scale=scale)
         probs = run.cast(
-            np.exp(logits - logits.max(-1, keepdims=True)) / np.exp(logits - logits.max(-1, keepdims=True)).sum(-1, keepdims=True)
+            np.exp(logits - logits.max(-1, keepdims=True))
+            / np.exp(logits - logits.max(-1, keepdims=True)).sum(-1, keepdims=True)
         )
         magnitude = (bins[128:] * np.abs(probs[..., 128:] - probs[..., 126::-1])).sum(-1) + run.tiny
-        run.expect("ordered_expectation", (probs, bins), reference.ordered_expectation(probs, bins), magnitude=magnitude, bound=64 * run.u)
+        run.expect(
+            "ordered_expectation",
+            (probs, bins),
+            reference.ordered_expectation(probs, bins),
+            magnitude=magnitude,
+            bound=64 * run.u,
+        )
 
 
 @check("TRA-11", uses=["ordered_expectation"], level=0)
 def expectation_is_exactly_antisymmetric(run: Run) -> None:
     """Mirror-symmetric probabilities give exactly 0, and mirroring the probabilities exactly changes the sign."""
-    run.exact("uniform probabilities", run.call("ordered_expectation", run.cast(np.full((3, 255), 1 / 255)), held_bins(run)), np.zeros(3))
+    run.exact(
+        "uniform probabilities",
+        run.call("ordered_expectation", run.cast(np.full((3, 255), 1 / 255)), held_bins(run)),
+        np.zeros(3),
+    )
 
     @run.for_all(seed=seeds())
     def _(seed: int) -> None:
@@ -199,4 +222,10 @@ def float32_or_better(run: Run) -> None:
     run.expect("twohot", (x, SMALL_BINS), reference.twohot(x, SMALL_BINS), magnitude=1.0, bound=64 * run.u)
     probs = np.array([0.1, 0.2, 0.3, 0.15, 0.25])
     held = run.cast(probs)
-    run.expect("ordered_expectation", (held, SMALL_BINS), reference.ordered_expectation(held, SMALL_BINS), magnitude=1.0, bound=64 * run.u)
+    run.expect(
+        "ordered_expectation",
+        (held, SMALL_BINS),
+        reference.ordered_expectation(held, SMALL_BINS),
+        magnitude=1.0,
+        bound=64 * run.u,
+    )

@@ -29,8 +29,13 @@ from spec import Config, Discrete, Image, Spaces, Vector, parameter_table
 
 ACTIONS: dict[str, Vector | Discrete] = {"turn": Vector(2)}
 TASK = Spaces({"position": Vector(3), "mode": Discrete((2, 3)), "image": Image(4, 6, 3)}, ACTIONS)
-SURE = math.log(3.0)  # logits (0, ln 3) and a mixture of one percent: 0.128082 nats from the uniform distribution, 0.140535 nats to it
-WEIGHTS = {f"{name}_scale": weight for name, weight in (("reconstruction", 2.0), ("reward", 3.0), ("continue", 5.0), ("dynamics", 7.0))}
+SURE = math.log(
+    3.0
+)  # logits (0, ln 3) and a mixture of one percent: 0.128082 nats from the uniform distribution, 0.140535 nats to it
+WEIGHTS = {
+    f"{name}_scale": weight
+    for name, weight in (("reconstruction", 2.0), ("reward", 3.0), ("continue", 5.0), ("dynamics", 7.0))
+}
 
 
 def held(run: Run, x: Any) -> np.ndarray:
@@ -44,14 +49,17 @@ def continue_target_literals(run: Run) -> None:
     is_terminal = np.array([[False, True, False], [True, False, False]])
     hard, soft = (small_config(run.profile, run.dtype, continue_target=kind) for kind in ("hard", "discounted"))
     run.exact("hard", run.call("continue_target", is_terminal, hard), np.array([[1.0, 0, 1], [0, 1, 1]]))
-    run.expect("continue_target", (is_terminal, soft), np.array([[1.0, 0, 1], [0, 1, 1]]) * (332 / 333), bound=4 * run.u)
+    run.expect(
+        "continue_target", (is_terminal, soft), np.array([[1.0, 0, 1], [0, 1, 1]]) * (332 / 333), bound=4 * run.u
+    )
     other = dataclasses.replace(soft, discount_horizon=4.0)
     run.exact("discount 3/4", run.call("continue_target", is_terminal[0], other), np.array([0.75, 0, 0.75]))
 
 
 @check("WM-10", "WM-11", "WM-14", "RSSM-10", uses=["kl_losses"], level=0)
 def kl_literals(run: Run) -> None:
-    """2, 7, 8 and 10 latents of 0.128082 nats give 1, 1, 1.024657 and 1.280821: sum, then clip, for each row by itself."""
+    """2, 7, 8 and 10 latents of 0.128082 nats give 1, 1, 1.024657 and 1.280821: sum, then clip, for each row by
+    itself."""
     config = small_config(run.profile, run.dtype, stoch=10, classes=2, latent_unimix=0.01, free_nats=1.0)
     sure, zeros = np.zeros((5, 10, 2)), np.zeros((5, 10, 2))
     for row, latents in enumerate((2, 7, 8, 10, 10)):
@@ -68,7 +76,8 @@ def kl_literals(run: Run) -> None:
 
 @check("WM-10", "RSSM-10", uses=["kl_losses"], level=0)
 def kl_is_bounded(run: Run) -> None:
-    """32 latents of 64 classes that are sure of different classes are 277.331813 nats apart: the mixture is in both distributions."""
+    """32 latents of 64 classes that are sure of different classes are 277.331813 nats apart: the mixture is in both
+    distributions."""
     config = small_config(run.profile, run.dtype, stoch=32, classes=64, latent_unimix=0.01)
     first, last = np.full((1, 32, 64), -1e4), np.full((1, 32, 64), -1e4)
     first[..., 0] = last[..., -1] = 1e4
@@ -76,7 +85,9 @@ def kl_is_bounded(run: Run) -> None:
     bound = 1e-8 if run.dtype == "float64" else 64 * run.u
     run.expect("kl_losses", (first, last, config), (expected, expected), bound=bound)
     half = np.zeros((1, 32, 64))
-    half[..., 0] = math.log(63)  # without mixture the probabilities are 1/2 and 63 times 1/126, here compared with 64 times 1/64
+    half[..., 0] = math.log(
+        63
+    )  # without mixture the probabilities are 1/2 and 63 times 1/126, here compared with 64 times 1/64
     expected = np.array([32 * (math.log(64 / 2) + math.log(64 / 126)) / 2])
     plain = dataclasses.replace(config, latent_unimix=0.0)
     run.expect("kl_losses", (held(run, half), np.zeros((1, 32, 64)), plain), (expected, expected), bound=bound)
@@ -90,11 +101,15 @@ def kl_matches(run: Run) -> None:
     @run.for_all(seed=seeds(), overrides=st.sampled_from(options), scale=st.sampled_from([0.1, 1.0, 10.0, 1e3]))
     def _(seed: int, overrides: dict[str, Any], scale: float) -> None:
         config = small_config(run.profile, run.dtype, **overrides)
-        posterior, prior = (held(run, normals(seed + i, 2, 4, config.stoch, config.classes, scale=scale)) for i in (0, 1))
+        posterior, prior = (
+            held(run, normals(seed + i, 2, 4, config.stoch, config.classes, scale=scale)) for i in (0, 1)
+        )
         log_q, log_p = (unimix_log_probs(logits, config.latent_unimix) for logits in (posterior, prior))
         magnitude = 1 + (np.exp(log_q) * (np.abs(log_q) + np.abs(log_p))).sum((-2, -1))
         expected = reference.kl_losses(posterior, prior, config)
-        run.expect("kl_losses", (posterior, prior, config), expected, magnitude=(magnitude, magnitude), bound=64 * run.u)
+        run.expect(
+            "kl_losses", (posterior, prior, config), expected, magnitude=(magnitude, magnitude), bound=64 * run.u
+        )
 
 
 @check("WM-14", "WM-18", uses=["kl_losses"], level=0)
@@ -118,7 +133,8 @@ def kl_extremes(run: Run) -> None:
 
 @check("WM-2", "WM-3", "WM-4", "WM-5", uses=["reconstruction_losses"], level=0)
 def reconstruction_literals(run: Run) -> None:
-    """Vector 10 at 1 costs 1.954111 times the scale; Discrete((2, 3)) at (0, 2) ln 4 + ln 3, whatever the scale; a pixel 0.25."""
+    """Vector 10 at 1 costs 1.954111 times the scale; Discrete((2, 3)) at (0, 2) ln 4 + ln 3, whatever the scale; a
+    pixel 0.25."""
     task = Spaces({"x": Vector(2), "kind": Discrete((2, 3)), "view": Image(2, 2, 1)}, ACTIONS)
     kind = held(run, [[0.0, SURE, 0.0, 0.0, 0.0]])
     predictions = {"x": np.array([[1.0, 0.0]]), "kind": kind, "view": np.full((1, 2, 2, 1), 0.5)}
@@ -128,22 +144,37 @@ def reconstruction_literals(run: Run) -> None:
         config = small_config(run.profile, run.dtype, vector_loss_scale=scale)
         expected = {"x": [1.954111 * scale], "kind": [2.4849066498], "view": [0.75 + 0.09]}
         expected_arrays = {key: np.array(value) for key, value in expected.items()}
-        run.expect("reconstruction_losses", (predictions, observations, task, config), expected_arrays, bound=1e-6 + 16 * run.u)
+        run.expect(
+            "reconstruction_losses", (predictions, observations, task, config), expected_arrays, bound=1e-6 + 16 * run.u
+        )
 
 
 @check("WM-2", "WM-3", "WM-4", "WM-5", "WM-18", "CON-24", uses=["reconstruction_losses"], level=0)
 def reconstruction_matches(run: Run) -> None:
-    """Random predictions and observations of any scale, two leading axes; one loss for each key, with predictions in float32 or better."""
+    """Random predictions and observations of any scale, two leading axes; one loss for each key, with predictions in
+    float32 or better."""
     config = small_config(run.profile, run.dtype)
 
-    @run.for_all(seed=seeds(), position=arrays(adversarial_numbers(finite=True), (2, 3, 3)), scale=st.sampled_from([0.1, 3.0, 100.0]))
+    @run.for_all(
+        seed=seeds(),
+        position=arrays(adversarial_numbers(finite=True), (2, 3, 3)),
+        scale=st.sampled_from([0.1, 3.0, 100.0]),
+    )
     def _(seed: int, position: np.ndarray, scale: float) -> None:
-        observations = random_observations(np.random.default_rng(seed), TASK, (2, 3)) | {"position": position.astype(np.float32)}
+        observations = random_observations(np.random.default_rng(seed), TASK, (2, 3)) | {
+            "position": position.astype(np.float32)
+        }
         brightness = np.random.default_rng(seed + 3).random((2, 3, 4, 6, 3))
-        drawn = {"position": normals(seed, 2, 3, 3, scale=scale), "mode": normals(seed + 1, 2, 3, 5, scale=scale), "image": brightness}
+        drawn = {
+            "position": normals(seed, 2, 3, 3, scale=scale),
+            "mode": normals(seed + 1, 2, 3, 5, scale=scale),
+            "image": brightness,
+        }
         predictions = {key: held(run, value) for key, value in drawn.items()}
         magnitude = {
-            "position": ((np.abs(predictions["position"]) + np.log1p(np.abs(observations["position"].astype(float)))) ** 2).sum(-1),
+            "position": (
+                (np.abs(predictions["position"]) + np.log1p(np.abs(observations["position"].astype(float)))) ** 2
+            ).sum(-1),
             "mode": 2 + 2 * np.abs(predictions["mode"]).max(-1),
             "image": ((brightness + observations["image"] / 255.0) ** 2).sum((-3, -2, -1)),
         }
@@ -170,12 +201,15 @@ def reconstruction_shows_nan(run: Run) -> None:
 
 @check("WM-19", "WM-3", "WM-4", "NET-4", "NET-6", "CON-8", uses=["reconstruction_losses"], level=0)
 def reconstruction_refuses(run: Run) -> None:
-    """Missing keys, shapes that do not fit, real numbers for a Discrete and anything but uint8 for an Image are refused."""
+    """Missing keys, shapes that do not fit, real numbers for a Discrete and anything but uint8 for an Image are
+    refused."""
     config = small_config(run.profile, run.dtype)
     observations = random_observations(run.rng(), TASK, (3,))
     predictions = {"position": np.zeros((3, 3)), "mode": np.zeros((3, 5)), "image": np.zeros((3, 4, 6, 3))}
 
-    def pair(changed: dict[str, np.ndarray], is_predictions: bool) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    def pair(
+        changed: dict[str, np.ndarray], is_predictions: bool
+    ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
         return (changed, observations) if is_predictions else (predictions, changed)
 
     for key in TASK.observations:
@@ -186,7 +220,14 @@ def reconstruction_refuses(run: Run) -> None:
             for rows in (mapping[key][:1], mapping[key][0]):
                 run.refuses("reconstruction_losses", *pair(missing | {key: rows}, mapping is predictions), TASK, config)
     for key, real in (("mode", np.float32), ("image", np.float32), ("image", np.int64)):
-        run.refuses("reconstruction_losses", predictions, observations | {key: observations[key].astype(real)}, TASK, config, naming=[key])
+        run.refuses(
+            "reconstruction_losses",
+            predictions,
+            observations | {key: observations[key].astype(real)},
+            TASK,
+            config,
+            naming=[key],
+        )
 
 
 @check("WM-19", "CON-8", uses=["kl_losses"], level=0)
@@ -200,7 +241,8 @@ def kl_refuses(run: Run) -> None:
 
 
 def constant_heads(run: Run, continue_logit: float) -> tuple[Problem, dict[str, np.ndarray]]:
-    """A problem whose weights are all zero, so that every prediction is the bias of its output layer, and these biases."""
+    """A problem whose weights are all zero, so that every prediction is the bias of its output layer, and these
+    biases."""
     problem = make_problem(run.seed, run.profile, "both", "mixed", run.dtype, **WEIGHTS)
     rng = run.rng()
     biases = {
@@ -210,19 +252,38 @@ def constant_heads(run: Run, continue_logit: float) -> tuple[Problem, dict[str, 
     } | {"continue/out/bias": np.array([continue_logit])}
     params = {name: np.zeros_like(value) for name, value in problem.state["params"].items()} | biases
     reward = np.array([[0, 1, -1, 3.3, 1e12], [-1e12, 20, 0.01, -7e4, 485165194]], np.float32)
-    changed = dataclasses.replace(problem, state=problem.state | {"params": params}, batch=problem.batch | {"reward": reward})
+    changed = dataclasses.replace(
+        problem, state=problem.state | {"params": params}, batch=problem.batch | {"reward": reward}
+    )
     return changed, biases
 
 
-@check("WM-2", "WM-3", "WM-4", "WM-5", "WM-6", "WM-8", "WM-11", "WM-14", "WM-15", "WM-16", "WM-18", uses=["losses"], level=2)
+@check(
+    "WM-2",
+    "WM-3",
+    "WM-4",
+    "WM-5",
+    "WM-6",
+    "WM-8",
+    "WM-11",
+    "WM-14",
+    "WM-15",
+    "WM-16",
+    "WM-18",
+    uses=["losses"],
+    level=2,
+)
 def losses_of_constant_predictions(run: Run) -> None:
-    """Where no prediction depends on the state, every loss is the plain mean over all steps, without weights; logits may be huge."""
+    """Where no prediction depends on the state, every loss is the plain mean over all steps, without weights; logits
+    may be huge."""
     for continue_logit in (6.0, 1000.0, -1000.0):
         problem, biases = constant_heads(run, continue_logit)
         batch, config = problem.batch, problem.config
         logits, mode = biases["decoder/vector/out/mode/bias"], batch["mode"]
         sigmoid = 1 / (1 + np.exp(-biases["decoder/image/out/bias"]))  # depth comes first
-        error = biases["decoder/vector/out/position/bias"] - np.sign(batch["position"]) * np.log1p(np.abs(batch["position"].astype(float)))
+        error = biases["decoder/vector/out/position/bias"] - np.sign(batch["position"]) * np.log1p(
+            np.abs(batch["position"].astype(float))
+        )
         log_softmax = unimix_log_probs(biases["reward/out/bias"], 0.0)
         target = (1.0 - batch["is_terminal"]) * (config.discount if config.continue_target == "discounted" else 1.0)
         entries = [unimix_log_probs(part, 0.0) for part in (logits[:3], logits[3:])]
@@ -241,35 +302,53 @@ def losses_of_constant_predictions(run: Run) -> None:
         for name, values in expected.items():
             magnitude = abs(continue_logit) if name == "continue" else values.mean()
             where = f"{name} with continue logit {continue_logit}"
-            run.compare(where, actual[name], values.mean(), magnitude=magnitude, bound=1e-12 if run.dtype == "float64" else 256 * run.u)
+            run.compare(
+                where,
+                actual[name],
+                values.mean(),
+                magnitude=magnitude,
+                bound=1e-12 if run.dtype == "float64" else 256 * run.u,
+            )
 
 
 @check("WM-1", "WM-6", "WM-8", "WM-9", "WM-15", "WM-16", "NET-1", uses=["losses"], level=2, dtypes=WHOLE)
 def losses_read_the_state_of_the_same_step(run: Run) -> None:
-    """With heads that depend strongly on memory and latents, each loss pairs state, reward, flag and observation of one step."""
+    """With heads that depend strongly on memory and latents, each loss pairs state, reward, flag and observation of one
+    step."""
     problem = problem_of(run, "both", "mixed")
     strong = ("reward/out/kernel", "continue/out/kernel", "decoder/vector/out/mode/kernel", "rssm/prior/out/kernel")
     params = {name: value * 8 if name in strong else value for name, value in problem.state["params"].items()}
-    names = [name for name in agent.losses(*problem.loss_arguments)[1]["losses"] if name not in ("actor", "critic", "replay_critic")]
+    names = [
+        name
+        for name in agent.losses(*problem.loss_arguments)[1]["losses"]
+        if name not in ("actor", "critic", "replay_critic")
+    ]
     arguments = (params, *problem.loss_arguments[1:])
     expected, actual = agent.losses(*arguments)[1]["losses"], run.call("losses", *arguments)[1]["losses"]
     for name in names:
-        run.compare(name, actual[name], expected[name], magnitude=abs(expected[name]) + 1, bound=bound_of(run, 1e-10, 2e-4))
+        run.compare(
+            name, actual[name], expected[name], magnitude=abs(expected[name]) + 1, bound=bound_of(run, 1e-10, 2e-4)
+        )
 
 
 def scaled(problem: Problem, scale: float) -> Problem:
     """The problem with larger or smaller logits of posterior and prior."""
     outputs = ("rssm/posterior/out/", "rssm/prior/out/")
-    params = {name: value * scale if name.startswith(outputs) else value for name, value in problem.state["params"].items()}
+    params = {
+        name: value * scale if name.startswith(outputs) else value for name, value in problem.state["params"].items()
+    }
     return dataclasses.replace(problem, state=problem.state | {"params": params})
 
 
 @check("WM-14", uses=["losses", "loss_derivatives"], level=2)
 def free_nats_leave_no_gradient(run: Run) -> None:
-    """Where posterior and prior are close everywhere, both losses are exactly the free nats and move with no parameter."""
+    """Where posterior and prior are close everywhere, both losses are exactly the free nats and move with no
+    parameter."""
     problem = scaled(make_problem(run.seed, run.profile, "vector", "continuous", run.dtype), 2.0**-6)
     losses = run.call("losses", *problem.loss_arguments)[1]["losses"]
-    derivatives = run.call("loss_derivatives", *problem.loss_arguments, list(unit_directions(problem, run.seed).values()))
+    derivatives = run.call(
+        "loss_derivatives", *problem.loss_arguments, list(unit_directions(problem, run.seed).values())
+    )
     for name in ("dynamics", "representation"):
         run.exact(name, losses[name], problem.config.free_nats)
         run.exact(f"derivatives of {name}", derivatives[name], np.zeros_like(derivatives[name]))
@@ -277,7 +356,8 @@ def free_nats_leave_no_gradient(run: Run) -> None:
 
 @check("WM-12", "WM-13", "RSSM-23", uses=["loss_derivatives"], level=2)
 def constants_of_the_kl(run: Run) -> None:
-    """Where every step is a reset: dynamics moves with prior and core alone, representation with posterior, encoder and core alone."""
+    """Where every step is a reset: dynamics moves with prior and core alone, representation with posterior, encoder and
+    core alone."""
     problem = scaled(make_problem(run.seed, run.profile, "vector", "continuous", run.dtype), 8.0)
     batch = problem.batch | {"is_first": np.ones_like(problem.batch["is_first"])}
     problem = dataclasses.replace(problem, batch=batch)
@@ -324,11 +404,18 @@ def sequences(seed: int, profile: str, dtype: str, observation: str, context: in
     config, task = small_config(profile, dtype), spaces(observation, "mixed")
     rng = np.random.default_rng(seed)
     for _ in range(1000):
-        noise = {"posterior": uniforms(rng, ROWS, context, config.stoch), "prior": uniforms(rng, ROWS, STEPS - context, config.stoch)}
+        noise = {
+            "posterior": uniforms(rng, ROWS, context, config.stoch),
+            "prior": uniforms(rng, ROWS, STEPS - context, config.stoch),
+        }
         params = random_parameters(rng, config, task, dtype)
         recorded = random_observations(rng, task, (ROWS, STEPS))
-        drawn = Sequences(params, recorded, random_actions(rng, task, (ROWS, STEPS)), STARTS, context, noise, task, config)
-        below, above = (reference.open_loop(*drawn.nudged(distance).arguments) for distance in (-SAMPLING_MARGIN, SAMPLING_MARGIN))
+        drawn = Sequences(
+            params, recorded, random_actions(rng, task, (ROWS, STEPS)), STARTS, context, noise, task, config
+        )
+        below, above = (
+            reference.open_loop(*drawn.nudged(distance).arguments) for distance in (-SAMPLING_MARGIN, SAMPLING_MARGIN)
+        )
         if all(np.array_equal(below[key], above[key]) for key in below):
             return drawn
     raise RuntimeError("no sequences keep every sample away from the next class")
@@ -336,7 +423,8 @@ def sequences(seed: int, profile: str, dtype: str, observation: str, context: in
 
 @check("WM-20", "WM-21", "WM-23", "RSSM-18", "NET-1", uses=["open_loop"], level=1, dtypes=WHOLE)
 def open_loop_matches(run: Run) -> None:
-    """Every prediction of every step: images, vectors in their units, probabilities, rewards; long and short contexts, and resets."""
+    """Every prediction of every step: images, vectors in their units, probabilities, rewards; long and short contexts,
+    and resets."""
     for observation, context in (("both", CONTEXT), ("vector", 1), ("vector", STEPS - 1)):
         drawn = sequences(run.seed, run.profile, run.dtype, observation, context)
         expected = reference.open_loop(*drawn.arguments)
@@ -346,7 +434,8 @@ def open_loop_matches(run: Run) -> None:
 
 @check("WM-23", uses=["open_loop"], level=1)
 def open_loop_literals(run: Run) -> None:
-    """Decoder outputs 1, -2 and 0 are 1.718282, -6.389056 and 0; logits 0, ln 3 a quarter and three; a reward between two bins."""
+    """Decoder outputs 1, -2 and 0 are 1.718282, -6.389056 and 0; logits 0, ln 3 a quarter and three; a reward between
+    two bins."""
     config, task = small_config(run.profile, run.dtype), spaces("both", "mixed")
     ln3 = float(round_to(SURE, "bfloat16"))  # so that every dtype holds it
     odds = math.exp(ln3)
@@ -355,7 +444,10 @@ def open_loop_literals(run: Run) -> None:
         "decoder/vector/out/mode/bias": np.array([0.0, ln3, 0, ln3, 0]),
         "decoder/image/out/bias": np.array([0.0, 0, ln3, -ln3]),  # depth comes first
         "continue/out/bias": np.array([ln3]),
-        "reward/out/bias": np.where(np.isin(np.arange(config.bins), (15, 16)), np.arange(config.bins) == 16, -1024 / ln3) * ln3,
+        "reward/out/bias": np.where(
+            np.isin(np.arange(config.bins), (15, 16)), np.arange(config.bins) == 16, -1024 / ln3
+        )
+        * ln3,
     }
     noise = {"posterior": np.zeros((1, 1, config.stoch)), "prior": np.zeros((1, 1, config.stoch))}
     observation = random_observations(run.rng(), task, (1, 2))
@@ -380,12 +472,16 @@ def same(one: dict[str, Any], other: dict[str, Any], row: int, steps: slice) -> 
 
 @check("WM-20", "WM-21", "WM-22", uses=["open_loop"], level=1)
 def open_loop_reads_only_the_context(run: Run) -> None:
-    """What is observed after the context changes nothing; the last step of it changes what follows, and nothing that came before."""
+    """What is observed after the context changes nothing; the last step of it changes what follows, and nothing that
+    came before."""
     drawn = sequences(run.seed, run.profile, "float64", "both", CONTEXT)
     before = run.call("open_loop", *drawn.arguments)
     others = random_observations(np.random.default_rng(run.seed + 1), drawn.spaces, (ROWS, STEPS))
     others["position"][:] = np.nan
-    hidden = {key: np.concatenate([value[:, :CONTEXT], others[key][:, CONTEXT:]], 1) for key, value in drawn.observation.items()}
+    hidden = {
+        key: np.concatenate([value[:, :CONTEXT], others[key][:, CONTEXT:]], 1)
+        for key, value in drawn.observation.items()
+    }
     after = run.call("open_loop", *dataclasses.replace(drawn, observation=hidden).arguments)
     for key, value in before.items():
         run.exact(f"{key} after other observations", after[key], value)
@@ -395,7 +491,10 @@ def open_loop_reads_only_the_context(run: Run) -> None:
         noise = drawn.noise | {"posterior": uniforms(rng, *drawn.noise["posterior"].shape)}
         before = run.call("open_loop", *dataclasses.replace(drawn, noise=noise).arguments)
         others = random_observations(rng, drawn.spaces, (ROWS, STEPS))
-        shown = {key: np.concatenate([value[:, : last.start], others[key][:, last.start :]], 1) for key, value in drawn.observation.items()}
+        shown = {
+            key: np.concatenate([value[:, : last.start], others[key][:, last.start :]], 1)
+            for key, value in drawn.observation.items()
+        }
         after = run.call("open_loop", *dataclasses.replace(drawn, noise=noise, observation=shown).arguments)
         run.holds("nothing changes before the observation that changed", same(before, after, 0, slice(last.start)))
         changes.append([not same(before, after, 0, steps) for steps in (last, slice(CONTEXT, None))])
@@ -404,7 +503,8 @@ def open_loop_reads_only_the_context(run: Run) -> None:
 
 @check("WM-20", "RSSM-13", "RSSM-14", "RSSM-18", uses=["open_loop"], level=1)
 def open_loop_follows_actions_and_resets(run: Run) -> None:
-    """An action moves the prediction of its own step and nothing before; after a reset nothing from before it counts, not even NaN."""
+    """An action moves the prediction of its own step and nothing before; after a reset nothing from before it counts,
+    not even NaN."""
     drawn = sequences(run.seed, run.profile, "float64", "vector", CONTEXT)
     before = run.call("open_loop", *drawn.arguments)
     for step in (1, CONTEXT, STEPS - 1):
@@ -431,7 +531,11 @@ def open_loop_refuses(run: Run) -> None:
         rest = {name: other for name, other in drawn.observation.items() if name != key}
         for wrong in (rest, rest | {key: value[..., :-1]}, rest | {key: value[:, :-1]}, rest | {key: value[:1]}):
             run.refuses("open_loop", *dataclasses.replace(drawn, observation=wrong).arguments, naming=[key])
-    for size in ((ROWS, STEPS, task.action_size - 1), (ROWS, STEPS - 1, task.action_size), (1, STEPS, task.action_size)):
+    for size in (
+        (ROWS, STEPS, task.action_size - 1),
+        (ROWS, STEPS - 1, task.action_size),
+        (1, STEPS, task.action_size),
+    ):
         run.refuses("open_loop", *dataclasses.replace(drawn, prev_action=np.zeros(size)).arguments)
     for starts in (STARTS[:, 0], STARTS[:1], STARTS[..., None]):
         run.refuses("open_loop", *dataclasses.replace(drawn, is_first=starts).arguments)

@@ -18,7 +18,8 @@ from conformance.reports import badge, html, junit, markdown, terminal
 from conformance.results import Data, identity, result_data, write, write_text
 from spec import editions, find_edition
 
-COLUMN_EDITION = "paper"  # of our own columns, unless another is given: they follow the configuration, so there is nothing to find out
+# of our own columns, unless another is given: they follow the configuration, so there is nothing to find out
+COLUMN_EDITION = "paper"
 RENDERED: dict[str, Callable[[Data], str]] = {
     "markdown": markdown.render,
     "junit": junit.render,
@@ -31,12 +32,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "candidate",
         nargs="?",
-        help="jax, torch or numpy; or an adapter of your own with functions of conformance/adapter.py: a module or a .py file",
+        help=(
+            "jax, torch or numpy; or an adapter of your own with functions of "
+            "conformance/adapter.py: a module or a .py file"
+        ),
     )
-    parser.add_argument("--process", metavar="COMMAND", help="a command that starts a candidate of its own, see docs/adapters.md")
+    parser.add_argument(
+        "--process", metavar="COMMAND", help="a command that starts a candidate of its own, see docs/adapters.md"
+    )
     parser.add_argument("--timeout", type=float, default=120.0, help="seconds that a process has for each reply")
     parser.add_argument("--dtype", choices=DTYPES, default="float64", help="precision of the backend")
-    parser.add_argument("--device", default=None, help="device of the backend, as the backend names it: cpu, cuda, gpu, ...")
+    parser.add_argument(
+        "--device", default=None, help="device of the backend, as the backend names it: cpu, cuda, gpu, ..."
+    )
     parser.add_argument(
         "--edition",
         choices=tuple(editions()),
@@ -45,14 +53,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--only", default="", help="only checks whose name or requirement id contains this")
     parser.add_argument("--seed", type=int, default=0, help="seed of the drawn cases")
     parser.add_argument("--examples", type=int, default=25, help="cases that hypothesis draws for each property")
-    parser.add_argument("--expect", type=Path, metavar="FILE", help="failures that are known, each with a reason: see docs/reports.md")
+    parser.add_argument(
+        "--expect", type=Path, metavar="FILE", help="failures that are known, each with a reason: see docs/reports.md"
+    )
     parser.add_argument("--at-least", type=int, default=1, metavar="N", help="fail unless so many checks pass")
     files = parser.add_argument_group("reports, written to files")
     files.add_argument("--json", type=Path, metavar="FILE", help="the whole result, see conformance/report.schema.json")
     files.add_argument("--markdown", type=Path, metavar="FILE", help="the result for people")
     files.add_argument("--junit", type=Path, metavar="FILE", help="JUnit XML for CI")
     files.add_argument(
-        "--html", type=Path, metavar="FILE", help="one page with all failing inputs; `conformance report` joins several results"
+        "--html",
+        type=Path,
+        metavar="FILE",
+        help="one page with all failing inputs; `conformance report` joins several results",
     )
     files.add_argument("--badge", type=Path, metavar="FILE", help="an SVG for a README")
 
@@ -76,12 +89,20 @@ def main(console: Console, options: argparse.Namespace) -> int:
             **{name: getattr(options, name) for name in ("dtype", "device", "only", "seed", "examples", "at_least")},
         )
         results = list(_run_all(console, checks, adapter, settings))
-        if named and telling_checks(result.check for result in results if result.status in FAILING and not result.extreme):
+        if named and telling_checks(
+            result.check for result in results if result.status in FAILING and not result.extreme
+        ):
             fits = _fit(console, checks, adapter, options)
         diagnoses = _diagnoses(console, adapter, results, settings)
         choice = "given" if asked else "claimed" if named else "best fit"
         data = result_data(
-            settings, implementation, results, expected, diagnoses, choice, to_json(fits, settings.edition) if fits else None
+            settings,
+            implementation,
+            results,
+            expected,
+            diagnoses,
+            choice,
+            to_json(fits, settings.edition) if fits else None,
         )
     terminal.show(console, data)
     if options.json:
@@ -116,7 +137,9 @@ def _run_all(console: Console, checks: list[Check], adapter: object, settings: S
 def _diagnoses(console: Console, adapter: object, results: list[Result], settings: Settings) -> list[Data]:
     """The mistakes that explain failures. What the edition has otherwise is none."""
     edition = editions()[settings.edition]
-    results = [result for result in results if result.status not in FAILING or not by_comparison(result, edition, settings)]
+    results = [
+        result for result in results if result.status not in FAILING or not by_comparison(result, edition, settings)
+    ]
     with console.status("comparing failures with known mistakes"):
         found = diagnose(adapter, results, settings.dtype, settings.profile, settings.seed, settings.examples)
     return [diagnosis.to_json() for diagnosis in found if diagnosis.mutant.name not in edition.mutants]

@@ -34,6 +34,9 @@ def main(console: Console, options: argparse.Namespace) -> int:
         console.print(f"not installed, so not looked at: {', '.join(absent)}")
     if "tests" not in there:
         unchecked = sum(not any(covering.values()) for covering in table.values())
-        console.print(f"no tests here (an installed package has none): {unchecked} requirements that no check covers are left to them")
+        console.print(
+            f"no tests here (an installed package has none): {unchecked} requirements "
+            f"that no check covers are left to them"
+        )
     console.print(f"{len(table)} requirements, {len(problems)} problems")
     return 1 if problems or not table else 0

@@ -24,14 +24,22 @@ from spec import built_profiles
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--backends", default="jax,torch,numpy", help="two or more of jax, torch, numpy, and adapters of your own: modules or .py files"
+        "--backends",
+        default="jax,torch,numpy",
+        help="two or more of jax, torch, numpy, and adapters of your own: modules or .py files",
     )
     parser.add_argument("--steps", type=int, default=1000, help="train steps")
-    parser.add_argument("--problems", default=",".join(PROBLEMS), help="vector has discrete actions, image continuous ones")
-    parser.add_argument("--dtype", choices=DTYPES, default="float64", help="precision of the backends; float64 has a bound")
+    parser.add_argument(
+        "--problems", default=",".join(PROBLEMS), help="vector has discrete actions, image continuous ones"
+    )
+    parser.add_argument(
+        "--dtype", choices=DTYPES, default="float64", help="precision of the backends; float64 has a bound"
+    )
     parser.add_argument("--profile", choices=built_profiles(), default="paper", help="profile of the configuration")
     parser.add_argument("--seed", type=int, default=0, help="seed of parameters, data and noise")
-    parser.add_argument("--out", type=Path, default=None, metavar="FOLDER", help="write numbers and pictures to this folder, too")
+    parser.add_argument(
+        "--out", type=Path, default=None, metavar="FOLDER", help="write numbers and pictures to this folder, too"
+    )
 
 
 def main(console: Console, options: argparse.Namespace) -> int:
@@ -44,7 +52,9 @@ def main(console: Console, options: argparse.Namespace) -> int:
         figure_class()
         _make_folder(options.out)
     members = {name: load_candidate(name, options.dtype) for name in options.backends.split(",") if name}
-    locksteps = {problem: Lockstep(members, problem, options.profile, options.dtype, options.seed) for problem in problems}
+    locksteps = {
+        problem: Lockstep(members, problem, options.profile, options.dtype, options.seed) for problem in problems
+    }
     begin = time.monotonic()
     try:
         _run(console, locksteps, options.steps)
@@ -118,7 +128,10 @@ def _write(options: argparse.Namespace, locksteps: dict[str, Lockstep], seconds:
     settings: dict[str, Any] = {name: getattr(options, name) for name in ("backends", "dtype", "profile", "seed")}
     steps = {problem: lockstep.steps for problem, lockstep in locksteps.items()}
     stem = f"lockstep-{options.dtype}"
-    write(options.out / f"{stem}.json", {**settings, "steps": steps, "seconds": round(seconds), "versions": versions(), "problems": found})
+    write(
+        options.out / f"{stem}.json",
+        {**settings, "steps": steps, "seconds": round(seconds), "versions": versions(), "problems": found},
+    )
     for problem, entry in found.items():
         title = f"Lockstep, problem {problem}, {options.dtype}, profile {options.profile}, seed {options.seed}"
         draw(options.out / f"{stem}-{problem}.png", entry, title, options.dtype == "float64")

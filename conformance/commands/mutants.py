@@ -20,7 +20,11 @@ EXAMPLES = 5
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--only", default="", help="only mutants whose name contains this")
-    parser.add_argument("--diagnose", action="store_true", help="check each as if a stranger had written it, and see whether it is named")
+    parser.add_argument(
+        "--diagnose",
+        action="store_true",
+        help="check each as if a stranger had written it, and see whether it is named",
+    )
     parser.add_argument("--json", type=Path, default=None, metavar="FILE", help="write the results to this file, too")
 
 
@@ -29,7 +33,15 @@ def main(console: Console, options: argparse.Namespace) -> int:
     if not mutants:
         raise UserError(f"no mutant matches --only {options.only!r}")
     view = Table()
-    for column in ("mutant", "mistake", "provenance", "deviates in", "raises in", "first", *["diagnosis"] * options.diagnose):
+    for column in (
+        "mutant",
+        "mistake",
+        "provenance",
+        "deviates in",
+        "raises in",
+        "first",
+        *["diagnosis"] * options.diagnose,
+    ):
         view.add_column(column, overflow="fold")
     report: dict[str, dict[str, Any]] = {}
     with console.status("running the checks on the reference without a mistake") as status:
@@ -40,7 +52,9 @@ def main(console: Console, options: argparse.Namespace) -> int:
             report[mutant.name] = entry = mutant_report(mutant, results)
             if options.diagnose:
                 # The checks that cannot notice the mutant pass.
-                unmoved = [Result(check, "pass", Worst(), 1) for check in reach if not reach[check] & mutant.edits.keys()]
+                unmoved = [
+                    Result(check, "pass", Worst(), 1) for check in reach if not reach[check] & mutant.edits.keys()
+                ]
                 found = diagnose(MutantAdapter(mutant), [*results, *unmoved], "float64", "paper", 0, EXAMPLES)
                 entry["diagnosis"] = [diagnosis_report(diagnosis) for diagnosis in found]
             view.add_row(*_row(mutant, entry))
@@ -52,7 +66,8 @@ def main(console: Console, options: argparse.Namespace) -> int:
     unnamed = sum("diagnosis" in entry and not is_named(name, entry["diagnosis"]) for name, entry in report.items())
     diagnosed = f", {unnamed} not named by the diagnosis" if options.diagnose else ""
     console.print(
-        f"{len(mutants)} mutants, {survivors} survived{diagnosed}; {len(reach)} checks, {len(broken)} more that the reference does not pass"
+        f"{len(mutants)} mutants, {survivors} survived{diagnosed}; {len(reach)} checks, {len(broken)} more "
+        f"that the reference does not pass"
     )
     if options.json:
         write(options.json, {"versions": versions(), "mutants": report})
@@ -89,7 +104,13 @@ def is_named(name: str, diagnoses: list[dict[str, Any]]) -> bool:
 
 def _row(mutant: Mutant, entry: dict[str, Any]) -> list[str]:
     killers = entry["deviates_in"] + entry["raises_in"]
-    row = [mutant.name, mutant.explanation, mutant.provenance, str(len(entry["deviates_in"])), str(len(entry["raises_in"]))]
+    row = [
+        mutant.name,
+        mutant.explanation,
+        mutant.provenance,
+        str(len(entry["deviates_in"])),
+        str(len(entry["raises_in"])),
+    ]
     row.append(killers[0] if killers else "[bold red]nothing")
     if "diagnosis" in entry:
         named = is_named(mutant.name, entry["diagnosis"])

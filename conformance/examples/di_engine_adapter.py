@@ -1,12 +1,12 @@
 """DI-engine 0.5: its DreamerV3, in `ding.policy.mbpolicy`, `ding.world_model` and `ding.torch_utils.network.dreamer`.
 
-Their code is time first with a last axis of length 1. The two-hot distribution has 255 bins, even between two ends in symlog space; the
-ends are taken from the bins that the kit gives. λ-returns and weights are results of `compute_target`, which here gets given predictions
-in place of networks. KL losses are means, taken of one state at a time. Where an agent has both real and discrete actions, each action key
-gets a policy of its own.
+Their code is time first with a last axis of length 1. The two-hot distribution has 255 bins, even between two ends in
+symlog space; the ends are taken from the bins that the kit gives. λ-returns and weights are results of
+`compute_target`, which here gets given predictions in place of networks. KL losses are means, taken of one state at a
+time. Where an agent has both real and discrete actions, each action key gets a policy of its own.
 
-Not offered: recurrent cell and heads, which have LayerNorm and other shapes than the kit's, and the actor's loss, which is the gradient
-through the dynamics and has no log-probabilities.
+Not offered: recurrent cell and heads, which have LayerNorm and other shapes than the kit's, and the actor's loss, which
+is the gradient through the dynamics and has no log-probabilities.
 """
 
 from importlib.metadata import version
@@ -58,8 +58,13 @@ def kl_losses(posterior_logits, prior_logits, config):
     rssm = Namespace(_discrete=config.classes, _unimix_ratio=config.latent_unimix)
     rssm.get_dist = lambda state: RSSM.get_dist(rssm, state)
     pairs = zip(posterior_logits.flatten(0, -3), prior_logits.flatten(0, -3), strict=True)
-    losses = [RSSM.kl_loss(rssm, {"logit": q[None]}, {"logit": p[None]}, False, config.free_nats, 1.0, 1.0)[2:] for q, p in pairs]
-    representation, dynamics = (torch.stack(kind).reshape(posterior_logits.shape[:-2]) for kind in zip(*losses, strict=True))
+    losses = [
+        RSSM.kl_loss(rssm, {"logit": q[None]}, {"logit": p[None]}, False, config.free_nats, 1.0, 1.0)[2:]
+        for q, p in pairs
+    ]
+    representation, dynamics = (
+        torch.stack(kind).reshape(posterior_logits.shape[:-2]) for kind in zip(*losses, strict=True)
+    )
     return dynamics, representation
 
 
@@ -148,6 +153,8 @@ def percentile(values, q):
 def update_return_range(low, high, returns, config):
     moving = RewardEMA("cpu", alpha=1 - config.return_decay)
     moving.values = torch.tensor([low, high], dtype=returns.dtype)
-    moving.range = torch.tensor([config.return_percentile_low / 100, config.return_percentile_high / 100], dtype=returns.dtype)
+    moving.range = torch.tensor(
+        [config.return_percentile_low / 100, config.return_percentile_high / 100], dtype=returns.dtype
+    )
     moving(returns)
     return tuple(moving.values)

@@ -1,6 +1,7 @@
 """distrax: categorical, normal and Bernoulli distributions.
 
-Written for distrax 0.1.9. A sample from given standard normal noise is the affine bijector; `log_prob` of a Bernoulli is negated.
+Written for distrax 0.1.9. A sample from given standard normal noise is the affine bijector; `log_prob` of a Bernoulli
+is negated.
 """
 
 import distrax

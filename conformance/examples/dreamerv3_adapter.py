@@ -1,12 +1,13 @@
 """dreamerv3 1.5: the code of the authors of DreamerV3, as released in 2023.
 
-Their code is time first, and has two-hot bins that are even between two ends in symlog space; the ends are taken from the bins that the kit
-gives. Distributions, KL losses, returns, weights and the actor's loss are methods of classes with networks. The methods are called as they
-are, with stand-ins for the networks; for the actor's loss, whose mean they take, one element at a time. Where an agent has both real and
-discrete actions, each action key gets a policy of its own.
+Their code is time first, and has two-hot bins that are even between two ends in symlog space; the ends are taken from
+the bins that the kit gives. Distributions, KL losses, returns, weights and the actor's loss are methods of classes with
+networks. The methods are called as they are, with stand-ins for the networks; for the actor's loss, whose mean they
+take, one element at a time. Where an agent has both real and discrete actions, each action key gets a policy of its
+own.
 
-Not offered: recurrent cell and heads, which have LayerNorm and other shapes in this edition, and the critic's loss, which the kit checks
-together with the one on replayed states. Adam and the clipping of gradients are those of Optax.
+Not offered: recurrent cell and heads, which have LayerNorm and other shapes in this edition, and the critic's loss,
+which the kit checks together with the one on replayed states. Adam and the clipping of gradients are those of Optax.
 """
 
 from functools import partial
@@ -62,13 +63,17 @@ def latents(logits, unimix):
 
 
 def unimix_log_probs(logits, unimix):
-    return jax.nn.log_softmax(latents(logits[..., None, :], unimix)[1]["logit"][..., 0, :])  # as their distributions do with logits
+    return jax.nn.log_softmax(
+        latents(logits[..., None, :], unimix)[1]["logit"][..., 0, :]
+    )  # as their distributions do with logits
 
 
 def kl_losses(posterior_logits, prior_logits, config):
     rssm, posterior = latents(posterior_logits, config.latent_unimix)
     prior = latents(prior_logits, config.latent_unimix)[1]
-    return tuple(method(rssm, posterior, prior, free=config.free_nats) for method in (nets.RSSM.dyn_loss, nets.RSSM.rep_loss))
+    return tuple(
+        method(rssm, posterior, prior, free=config.free_nats) for method in (nets.RSSM.dyn_loss, nets.RSSM.rep_loss)
+    )
 
 
 def draw_categorical(logits, unimix, seed, n):
@@ -77,7 +82,8 @@ def draw_categorical(logits, unimix, seed, n):
 
 
 def head(kind, outputs, shape, **options):
-    """The distribution that one of their heads makes of the outputs of its last layers: {"out": ...} and perhaps {"std": ...}."""
+    """The distribution that one of their heads makes of the outputs of its last layers: {"out": ...} and perhaps
+    {"std": ...}."""
     options = {"_minstd": 1.0, "_maxstd": 1.0, "_unimix": 0.0, **options}
     one = network(_dist=kind, _shape=shape, _outscale=1.0, _outnorm=False, _bins=255, **options)
     one.get = lambda name, *size, **initial: lambda inputs: outputs[name]
@@ -157,7 +163,9 @@ def cumulative_weights(continue_, discount):
     state = {"deter": jnp.zeros((rows, 1))}
     model = network(
         rssm=Namespace(initial=lambda size: state, img_step=lambda state, action: {"deter": state["deter"]}),
-        heads={"cont": lambda trajectory: Namespace(mode=lambda: continue_.T)},  # given, in place of the most likely flag of a head
+        heads={
+            "cont": lambda trajectory: Namespace(mode=lambda: continue_.T)
+        },  # given, in place of the most likely flag of a head
         config=Namespace(horizon=horizon_of(discount), imag_unroll=True),
     )
     start = {**state, "is_terminal": 1 - continue_[:, 0]}
@@ -195,7 +203,9 @@ def actor_loss(log_prob, entropy, returns, value, weight, scale, config):
 
 
 def one_actor_loss(log_prob, entropy, returns, value, weight, scale, config):
-    twice = partial(jnp.repeat, repeats=2, axis=0)  # an imagined state, and the one after it, which the loss does not read
+    twice = partial(
+        jnp.repeat, repeats=2, axis=0
+    )  # an imagined state, and the one after it, which the loss does not read
     policy = Namespace(log_prob=lambda action: twice(log_prob), entropy=lambda: twice(entropy))
     learner = network(
         scales={"extr": 1.0},

@@ -1,7 +1,8 @@
 """equinox: linear and convolution layers, RMSNorm.
 
-Written for equinox 0.13.8. Its layers work on one example, channels first, and keep kernels as [out, in, ...]: the adapter swaps the axes
-and gives the layers the parameters. A transposed convolution is that of `lax.conv_transpose` on a kernel that has been flipped.
+Written for equinox 0.13.8. Its layers work on one example, channels first, and keep kernels as [out, in, ...]: the
+adapter swaps the axes and gives the layers the parameters. A transposed convolution is that of `lax.conv_transpose` on
+a kernel that has been flipped.
 """
 
 import equinox as eqx

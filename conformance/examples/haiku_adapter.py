@@ -36,7 +36,9 @@ def draw_parameters(spaces, config, seed):
         values = {}
         for name, entry in parameter_table(config, spaces).items():
             truncated = (
-                hk.initializers.VarianceScaling(entry.outscale**2, "fan_in", "truncated_normal") if entry.outscale else kinds["zeros"]
+                hk.initializers.VarianceScaling(entry.outscale**2, "fan_in", "truncated_normal")
+                if entry.outscale
+                else kinds["zeros"]
             )
             values[name] = kinds.get(entry.initializer, truncated)(entry.shape, jnp.float32)
         return values

@@ -1,7 +1,8 @@
-"""optax: adaptive gradient clipping, LaProp put together of RMS scaling and a moving average, warmup, losses, moving averages.
+"""optax: adaptive gradient clipping, LaProp put together of RMS scaling and a moving average, warmup, losses, moving
+averages.
 
-Written for optax 0.2.8. Gradients are clipped over all axes; the default there is by output unit. `learning_rate` is what
-`scale_by_learning_rate` would multiply by.
+Written for optax 0.2.8. Gradients are clipped over all axes; the default there is by output unit. `learning_rate` is
+what `scale_by_learning_rate` would multiply by.
 """
 
 import jax
@@ -56,4 +57,6 @@ def categorical_kl(log_probs_p, log_probs_q):
 
 
 def update_slow_critic(slow, critic, decay):
-    return optax.incremental_update({name: x for name, x in critic.items() if name.startswith("critic/")}, slow, 1 - decay)
+    return optax.incremental_update(
+        {name: x for name, x in critic.items() if name.startswith("critic/")}, slow, 1 - decay
+    )

@@ -1,8 +1,8 @@
 """rlax: signed logarithm, two-hot encoding over given bins, λ-returns, categorical and squared losses.
 
-Written for rlax 0.1.9. Its two-hot encoding over uneven bins is `unbiased_transform_pair`, which wants at least one leading axis. Its
-λ-returns are those of one trajectory, from the first transition on, with a discount for each step. Its l2_loss is half a square, and its
-categorical functions take logits, which log-probabilities are too.
+Written for rlax 0.1.9. Its two-hot encoding over uneven bins is `unbiased_transform_pair`, which wants at least one
+leading axis. Its λ-returns are those of one trajectory, from the first transition on, with a discount for each step.
+Its l2_loss is half a square, and its categorical functions take logits, which log-probabilities are too.
 """
 
 import warnings

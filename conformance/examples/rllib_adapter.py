@@ -1,11 +1,11 @@
 """RLlib of ray 2.60: its DreamerV3 for PyTorch, `ray.rllib.algorithms.dreamerv3`.
 
-Their code is time first. Losses and returns are methods of `DreamerV3TorchLearner`; they are called as they are, with stand-ins for the
-learner, its configuration and its actor, and the actor's loss, which is a mean, one element at a time. The scale of the returns is read off
-advantages that were divided by it.
+Their code is time first. Losses and returns are methods of `DreamerV3TorchLearner`; they are called as they are, with
+stand-ins for the learner, its configuration and its actor, and the actor's loss, which is a mean, one element at a
+time. The scale of the returns is read off advantages that were divided by it.
 
-Not offered: bins and two-hot losses, which are 255 even bins in symlog space and written inside of longer functions; recurrent cell and
-heads, which have LayerNorm and other shapes than the kit's.
+Not offered: bins and two-hot losses, which are 255 even bins in symlog space and written inside of longer functions;
+recurrent cell and heads, which have LayerNorm and other shapes than the kit's.
 """
 
 from importlib.metadata import version
@@ -62,7 +62,9 @@ def lambda_return(reward, continue_, value, discount, lambda_):
 
 def learner_of(low, high, **attributes):
     """A learner, and its actor, which keeps the range of the returns."""
-    actor = Namespace(**{f"ema_value_target_pct{q}": torch.as_tensor(x) for q, x in ((5, low), (95, high))}, **attributes)
+    actor = Namespace(
+        **{f"ema_value_target_pct{q}": torch.as_tensor(x) for q, x in ((5, low), (95, high))}, **attributes
+    )
     learner = Namespace(module={"default": Namespace(unwrapped=lambda: Namespace(actor=actor))})
     learner._compute_scaled_value_targets = lambda **given: Learner._compute_scaled_value_targets(learner, **given)
     learner.metrics = Namespace(log_dict=lambda *values, **options: None)
@@ -73,7 +75,9 @@ def advantages(low, high, returns, values, decay):
     """Scaled advantages [H, N], and the range afterwards."""
     learner, actor = learner_of(low, high)
     given = {"value_targets_t0_to_Hm1_BxT": returns, "value_predictions_t0_to_Hm1_BxT": values}
-    scaled = learner._compute_scaled_value_targets(module_id="default", config=Namespace(return_normalization_decay=decay), **given)
+    scaled = learner._compute_scaled_value_targets(
+        module_id="default", config=Namespace(return_normalization_decay=decay), **given
+    )
     return scaled, (actor.ema_value_target_pct5, actor.ema_value_target_pct95)
 
 
@@ -96,10 +100,18 @@ def one_actor_loss(log_prob, entropy, returns, value, weight, scale, config):
     policy = Namespace(entropy=lambda: entropy)
     space = gymnasium.spaces.Discrete(2)
     learner, _ = learner_of(0.0, float(scale), action_space=space, get_action_dist_object=lambda parameters: policy)
-    settings = Namespace(return_normalization_decay=1.0, entropy_scale=config.entropy_scale, report_individual_batch_item_stats=False)
-    twice = {"values_dreamed": value, "actions_dreamed": torch.ones(1, 1, 1), "actions_dreamed_dist_params": log_prob[..., None]}
+    settings = Namespace(
+        return_normalization_decay=1.0, entropy_scale=config.entropy_scale, report_individual_batch_item_stats=False
+    )
+    twice = {
+        "values_dreamed": value,
+        "actions_dreamed": torch.ones(1, 1, 1),
+        "actions_dreamed_dist_params": log_prob[..., None],
+    }
     twice["dream_loss_weights"] = weight
-    dreams = {f"{name}_t0_to_H_BxT": torch.cat([x, x]) for name, x in twice.items()}  # the last imagined state is not read
+    dreams = {
+        f"{name}_t0_to_H_BxT": torch.cat([x, x]) for name, x in twice.items()
+    }  # the last imagined state is not read
     return Learner._compute_actor_loss(
         learner, module_id="default", config=settings, dream_data=dreams, value_targets_t0_to_Hm1_BxT=returns
     )

@@ -1,7 +1,8 @@
 """rssmlite 0.1: a small world model in the style of DreamerV3, for vector observations.
 
-Their KL loss is one number, a mean over states of both terms, weighted with `alpha` and 1 - `alpha`: it is called for one state at a time.
-Their λ-return takes rewards and continues from step 1 on. Rewards and values are real numbers in symlog space, so that there are no bins.
+Their KL loss is one number, a mean over states of both terms, weighted with `alpha` and 1 - `alpha`: it is called for
+one state at a time. Their λ-return takes rewards and continues from step 1 on. Rewards and values are real numbers in
+symlog space, so that there are no bins.
 """
 
 from importlib.metadata import version

@@ -1,12 +1,13 @@
 """sheeprl 0.8: its DreamerV3 after the paper of 2023, `sheeprl.algos.dreamer_v3`.
 
-Their code is time first with a last axis of length 1, keeps latents flat, and has two-hot bins that are even between two ends in symlog
-space; the ends are taken from the bins that the kit gives. What they write inside of a longer function is reached by calling that function
-with stand-ins for the networks, one element at a time: `reconstruction_loss` for the KL losses, `imagine` for the weights, `Actor.forward`
-for the policies. Where an agent has both real and discrete actions, each action key gets a policy of its own.
+Their code is time first with a last axis of length 1, keeps latents flat, and has two-hot bins that are even between
+two ends in symlog space; the ends are taken from the bins that the kit gives. What they write inside of a longer
+function is reached by calling that function with stand-ins for the networks, one element at a time:
+`reconstruction_loss` for the KL losses, `imagine` for the weights, `Actor.forward` for the policies. Where an agent has
+both real and discrete actions, each action key gets a policy of its own.
 
-Not offered: recurrent cell and heads, which have LayerNorm and other shapes in this edition, and the critic's loss, which the kit checks
-together with the one on replayed states. Adam and the clipping of gradients are those of PyTorch.
+Not offered: recurrent cell and heads, which have LayerNorm and other shapes in this edition, and the critic's loss,
+which the kit checks together with the one on replayed states. Adam and the clipping of gradients are those of PyTorch.
 """
 
 from importlib.metadata import version
@@ -17,7 +18,12 @@ from sheeprl.algos.dreamer_v2.utils import compute_stochastic_state
 from sheeprl.algos.dreamer_v3 import dreamer_v3, loss
 from sheeprl.algos.dreamer_v3.agent import RSSM, Actor
 from sheeprl.algos.dreamer_v3.utils import Moments, compute_lambda_values
-from sheeprl.utils.distribution import BernoulliSafeMode, MSEDistribution, SymlogDistribution, TwoHotEncodingDistribution
+from sheeprl.utils.distribution import (
+    BernoulliSafeMode,
+    MSEDistribution,
+    SymlogDistribution,
+    TwoHotEncodingDistribution,
+)
 from sheeprl.utils.utils import symexp, symlog
 from torch.distributions import Distribution
 
@@ -56,7 +62,9 @@ def symexp_twohot_mean(logits, bins):
 
 
 def unimix_log_probs(logits, unimix):
-    return Actor._uniform_mix(Namespace(_unimix=unimix), logits).log_softmax(-1)  # what PyTorch's distributions do with logits
+    return Actor._uniform_mix(Namespace(_unimix=unimix), logits).log_softmax(
+        -1
+    )  # what PyTorch's distributions do with logits
 
 
 def mixed_latents(logits, config):
@@ -97,7 +105,10 @@ def draw_categorical(logits, unimix, seed, n):
 def kl_losses(posterior_logits, prior_logits, config):
     posteriors, priors = mixed_latents(posterior_logits, config)[0], mixed_latents(prior_logits, config)[0]
     losses = torch.stack(
-        [torch.stack([one_kl(q, p, config, share) for share in (1.0, 0.0)]) for q, p in zip(posteriors, priors, strict=True)]
+        [
+            torch.stack([one_kl(q, p, config, share) for share in (1.0, 0.0)])
+            for q, p in zip(posteriors, priors, strict=True)
+        ]
     )
     return tuple(losses.mT.unflatten(-1, posterior_logits.shape[:-2]))
 
@@ -107,7 +118,9 @@ def one_kl(posterior, prior, config, share):
     zero = torch.zeros(1, 1, 1)
     nothing = MSEDistribution(zero, dims=1)
     given = {"kl_dynamic": share, "kl_representation": 1 - share, "kl_free_nats": config.free_nats}
-    return loss.reconstruction_loss({"x": nothing}, {"x": zero}, nothing, zero, prior[None, None], posterior[None, None], **given)[2]
+    return loss.reconstruction_loss(
+        {"x": nothing}, {"x": zero}, nothing, zero, prior[None, None], posterior[None, None], **given
+    )[2]
 
 
 def bounded_normal(mean, std, min_std, max_std):
@@ -122,8 +135,12 @@ def policies(outputs, spaces, config):
     found = []
     for key, space in sorted(spaces.actions.items()):
         raw, continuous = outputs[key], "mean" in outputs[key]
-        parts = [torch.cat([raw["mean"], raw["std"]], -1)] if continuous else raw["logits"].split(list(space.classes), -1)
-        actor = Namespace(is_continuous=continuous, distribution="scaled_normal" if continuous else "discrete", init_std=2.0)
+        parts = (
+            [torch.cat([raw["mean"], raw["std"]], -1)] if continuous else raw["logits"].split(list(space.classes), -1)
+        )
+        actor = Namespace(
+            is_continuous=continuous, distribution="scaled_normal" if continuous else "discrete", init_std=2.0
+        )
         actor.min_std, actor.max_std, actor._unimix = config.actor_min_std, config.actor_max_std, config.actor_unimix
         actor._uniform_mix = lambda logits, actor=actor: Actor._uniform_mix(actor, logits)
         actor.model, actor.mlp_heads = (lambda state: state), [lambda state, part=part: part for part in parts]
@@ -133,7 +150,10 @@ def policies(outputs, spaces, config):
 
 def action_log_prob(outputs, action, spaces, config):
     every = policies(outputs, spaces, config)
-    return sum(policy.log_prob(part) for (_, policy), part in zip(every, action.split([s.shape[-1] for s, _ in every], -1), strict=True))
+    return sum(
+        policy.log_prob(part)
+        for (_, policy), part in zip(every, action.split([s.shape[-1] for s, _ in every], -1), strict=True)
+    )
 
 
 def action_entropy(outputs, spaces, config):
@@ -161,7 +181,9 @@ def cumulative_weights(continue_, discount):
     )
     sizes = {"horizon": steps - 1, "gamma": discount, "lmbda": 0.95}
     start = zero[..., None], zero, 1 - continue_[:, 0]
-    return dreamer_v3.imagine(model, lambda states, clip: ([zero], None), lambda states: logits, *start, **sizes)[-1][:-1, :, 0].mT
+    return dreamer_v3.imagine(model, lambda states, clip: ([zero], None), lambda states: logits, *start, **sizes)[-1][
+        :-1, :, 0
+    ].mT
 
 
 def percentile(values, q):

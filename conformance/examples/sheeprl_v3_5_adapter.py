@@ -1,12 +1,13 @@
 """sheeprl 0.8: its DreamerV3 after the Nature paper, `sheeprl.algos.dreamer_v3_5`.
 
-Their code is time first, keeps latents flat, and computes losses in float32. What they write inside of a longer function is reached by
-calling that function with stand-ins for the networks, one element at a time: `world_model_loss` for the KL losses, `imagine` for the
-weights, and `actor_critic_loss` for the losses of actor and critic. Their policies have either real or discrete actions; where an agent
-has both, each action key gets a policy of its own here, and log-probabilities and entropies are added up as theirs are.
+Their code is time first, keeps latents flat, and computes losses in float32. What they write inside of a longer
+function is reached by calling that function with stand-ins for the networks, one element at a time: `world_model_loss`
+for the KL losses, `imagine` for the weights, and `actor_critic_loss` for the losses of actor and critic. Their policies
+have either real or discrete actions; where an agent has both, each action key gets a policy of its own here, and
+log-probabilities and entropies are added up as theirs are.
 
-Layers, encoder and decoder stand in `sheeprl_v3_5_networks`. Not offered: samples from given noise, since they draw with the generator of
-PyTorch; whole training steps, which take a configuration of Hydra and a Fabric.
+Layers, encoder and decoder stand in `sheeprl_v3_5_networks`. Not offered: samples from given noise, since they draw
+with the generator of PyTorch; whole training steps, which take a configuration of Hydra and a Fabric.
 """
 
 from importlib.metadata import version
@@ -94,10 +95,16 @@ def rssm_of(params, config):
     flat, tokens = config.stoch * config.classes, len(params["rssm/posterior/hidden0/kernel"]) - config.deter
     actions, epsilon = len(params["rssm/embed_action/kernel"]), config.norm_epsilon
     recurrent = agent.RecurrentModel(config.deter, flat, actions, config.units, config.blocks, eps=epsilon)
-    posterior = agent.RepresentationModel(config.deter, tokens, config.units, flat, config.posterior_layers, eps=epsilon)
-    prior = nn.Sequential(*agent.mlp(config.deter, config.units, config.prior_layers, eps=epsilon), agent.Linear(config.units, flat))
+    posterior = agent.RepresentationModel(
+        config.deter, tokens, config.units, flat, config.posterior_layers, eps=epsilon
+    )
+    prior = nn.Sequential(
+        *agent.mlp(config.deter, config.units, config.prior_layers, eps=epsilon), agent.Linear(config.units, flat)
+    )
     embeddings = dense_of(params, "rssm/embed_deter", "rssm/embed_stoch", "rssm/embed_action")
-    blocks = [params[f"rssm/{name}"] for name in ("hidden/kernel", "hidden/bias", "hidden/scale", "gru/kernel", "gru/bias")]
+    blocks = [
+        params[f"rssm/{name}"] for name in ("hidden/kernel", "hidden/bias", "hidden/scale", "gru/kernel", "gru/bias")
+    ]
     fill(recurrent, embeddings + blocks)
     fill(posterior, mlp_of(params, "rssm/posterior", config.posterior_layers) + out_of(params, "rssm/posterior/out"))
     fill(prior, mlp_of(params, "rssm/prior", config.prior_layers) + out_of(params, "rssm/prior/out"))
@@ -115,7 +122,9 @@ def prior(params, deter, config):
 
 def posterior(params, deter, tokens, config):
     rssm = rssm_of(params, config)
-    return rssm.representation_model(deter, rssm.project_observations(tokens)).unflatten(-1, (config.stoch, config.classes))
+    return rssm.representation_model(deter, rssm.project_observations(tokens)).unflatten(
+        -1, (config.stoch, config.classes)
+    )
 
 
 def observe_given(params, carry, tokens, prev_action, is_first, stoch, config):
@@ -131,7 +140,11 @@ def observe_given(params, carry, tokens, prev_action, is_first, stoch, config):
         states.append(rssm.dynamic(previous[:, t], states[-1], actions[:, t], projections[:, t], 1 - keep[:, t])[0])
     deter, shape = torch.stack(states[1:], 1), (config.stoch, config.classes)
     prior_logits = rssm.transition_model(deter)
-    return {"deter": deter, "posterior": torch.stack(logits, 1).unflatten(-1, shape), "prior": prior_logits.unflatten(-1, shape)}
+    return {
+        "deter": deter,
+        "posterior": torch.stack(logits, 1).unflatten(-1, shape),
+        "prior": prior_logits.unflatten(-1, shape),
+    }
 
 
 def imagine_given(params, carry, action, stoch, config):
@@ -174,7 +187,9 @@ def actor(params, feature, spaces, config):
     for key, space in spaces.actions.items():
         continuous = not hasattr(space, "classes")
         sizes = [space.size] if continuous else list(space.classes)
-        policy = agent.Actor(feature.shape[-1], sizes, continuous, config.units, config.actor_layers, eps=config.norm_epsilon)
+        policy = agent.Actor(
+            feature.shape[-1], sizes, continuous, config.units, config.actor_layers, eps=config.norm_epsilon
+        )
         names = ("mean", "std") if continuous else ("logits",)
         kernel = torch.cat([params[f"actor/out/{key}/{name}/kernel"] for name in names], -1)
         bias = torch.cat([params[f"actor/out/{key}/{name}/bias"] for name in names])
@@ -218,7 +233,9 @@ def action_log_prob(outputs, action, spaces, config):
 
 
 def action_entropy(outputs, spaces, config):
-    return sum(one.entropy() for policy, state, *_ in policies(outputs, spaces, config) for one in policy.distributions(state))
+    return sum(
+        one.entropy() for policy, state, *_ in policies(outputs, spaces, config) for one in policy.distributions(state)
+    )
 
 
 def draw_actions(outputs, spaces, config, seed, n):
@@ -261,8 +278,16 @@ def one_kl(posterior_logits, prior_logits, config, share):
         "representation_scale": 1 - share,
     }
     keys = {"cnn_keys": (), "mlp_keys": ("x",), "cnn_decoder_keys": (), "mlp_decoder_keys": ("x",)}
-    rest = {"kl_free_nats": config.free_nats, "continue_target": 1.0, "reward_grad": True, "replay_grad": True, "entropies": False}
-    metrics = dreamer_v3_5.world_model_loss(model, {"x": zero}, zero, zero, zero, zero, zero, zero, **keys, **rest, **scales)[-1]
+    rest = {
+        "kl_free_nats": config.free_nats,
+        "continue_target": 1.0,
+        "reward_grad": True,
+        "replay_grad": True,
+        "entropies": False,
+    }
+    metrics = dreamer_v3_5.world_model_loss(
+        model, {"x": zero}, zero, zero, zero, zero, zero, zero, **keys, **rest, **scales
+    )[-1]
     return metrics["Loss/state_loss"]
 
 
@@ -290,14 +315,32 @@ def cumulative_weights(continue_, discount):
     return dreamer_v3_5.imagine(model, lambda states: ([zero], None), critic, critic, zero, zero, **sizes)[-1][:-1].mT
 
 
-def behavior_losses(actor=None, imagined=None, actions=None, values=None, slow_values=None, returns=None, weight=None, scale=1.0, **given):
-    """Metrics of `actor_critic_loss` for one imagined state. A state is the logits of the critic, then those of the slow critic."""
+def behavior_losses(
+    actor=None,
+    imagined=None,
+    actions=None,
+    values=None,
+    slow_values=None,
+    returns=None,
+    weight=None,
+    scale=1.0,
+    **given,
+):
+    """Metrics of `actor_critic_loss` for one imagined state. A state is the logits of the critic, then those of the
+    slow critic."""
     empty = torch.zeros(2, 1, 2 * 255) if imagined is None else imagined
     bins = empty.shape[-1] // 2
     pair = torch.zeros(2, 1)
     policy = Namespace(log_prob=lambda action: pair[:1], entropy=lambda: pair[:1]) if actor is None else actor
     rest = {"ent_coef": 0.0, "slow_regularizer": 1.0, "replay_loss": False, **given}
-    sizes = {"actions_dim": (1,), "gamma": 1.0, "lmbda": 1.0, "policy_scale": 1.0, "value_scale": 1.0, "replay_value_scale": 1.0}
+    sizes = {
+        "actions_dim": (1,),
+        "gamma": 1.0,
+        "lmbda": 1.0,
+        "policy_scale": 1.0,
+        "value_scale": 1.0,
+        "replay_value_scale": 1.0,
+    }
     replayed = {name: rest.pop(name, pair) for name in ("latent_states", "last", "terminated", "rewards")}
     return dreamer_v3_5.actor_critic_loss(
         lambda states, with_actions: ((), (policy,)),
@@ -324,7 +367,13 @@ def actor_loss(log_prob, entropy, returns, value, weight, scale, config):
     losses = []
     for lp, e, r, v, w in zip(*(x.flatten() for x in (log_prob, entropy, returns, value, weight)), strict=True):
         policy = Namespace(log_prob=lambda action, lp=lp: lp.reshape(1, 1), entropy=lambda e=e: e.reshape(1, 1))
-        given = {"values": twice(v), "returns": r.reshape(1, 1), "weight": twice(w), "scale": scale, "ent_coef": config.entropy_scale}
+        given = {
+            "values": twice(v),
+            "returns": r.reshape(1, 1),
+            "weight": twice(w),
+            "scale": scale,
+            "ent_coef": config.entropy_scale,
+        }
         losses.append(behavior_losses(policy, **given)["Loss/policy_loss"])
     return torch.stack(losses).reshape(returns.shape)
 
@@ -336,14 +385,18 @@ def critic_loss(logits, slow_logits, returns, weight, config):
         logit, slow, slow_value, target, w = rows
         states = torch.cat([logit, slow]).expand(2, 1, -1)
         given = {"slow_values": twice(slow_value), "returns": target.reshape(1, 1), "weight": twice(w)}
-        losses.append(behavior_losses(imagined=states, slow_regularizer=config.slow_critic_scale, **given)["Loss/value_loss"])
+        losses.append(
+            behavior_losses(imagined=states, slow_regularizer=config.slow_critic_scale, **given)["Loss/value_loss"]
+        )
     return torch.stack(losses).reshape(returns.shape)
 
 
 def replay_critic_loss(logits, slow_logits, returns, is_last, config):
     """Two replayed steps each: where the second is terminal, its reward is the return of the first."""
     losses = []
-    for logit, slow, target, last in zip(*(x.flatten(0, 1) for x in (logits, slow_logits, returns, is_last)), strict=True):
+    for logit, slow, target, last in zip(
+        *(x.flatten(0, 1) for x in (logits, slow_logits, returns, is_last)), strict=True
+    ):
         states = torch.cat([logit, slow]).expand(2, 1, -1)
         given = {
             "latent_states": states,
@@ -353,7 +406,9 @@ def replay_critic_loss(logits, slow_logits, returns, is_last, config):
         }
         imagined = {"imagined": states.expand(2, 2, -1), "values": torch.zeros(2, 2), "slow_values": torch.zeros(2, 2)}
         weights = {"returns": torch.zeros(1, 2), "weight": torch.zeros(2, 2)}
-        metrics = behavior_losses(**imagined, **weights, replay_loss=True, slow_regularizer=config.slow_critic_scale, **given)
+        metrics = behavior_losses(
+            **imagined, **weights, replay_loss=True, slow_regularizer=config.slow_critic_scale, **given
+        )
         losses.append(metrics["Loss/replay_value_loss"])
     return torch.stack(losses).reshape(returns.shape)
 
@@ -363,7 +418,12 @@ def replay_critic_loss(logits, slow_logits, returns, is_last, config):
 
 def optimizer_of(params, gradients, second_moment, momentum, step, config, **changes):
     tensors = {name: nn.Parameter(value.clone()) for name, value in params.items()}
-    options = {"betas": (config.beta1, config.beta2), "eps": config.laprop_epsilon, "agc": config.agc_clip, "agc_pmin": config.agc_epsilon}
+    options = {
+        "betas": (config.beta1, config.beta2),
+        "eps": config.laprop_epsilon,
+        "agc": config.agc_clip,
+        "agc_pmin": config.agc_epsilon,
+    }
     options |= {"lr": config.learning_rate, "warmup": config.warmup_steps, **changes}
     optimizer = LaProp(tensors.values(), **options)
     for name, tensor in tensors.items():

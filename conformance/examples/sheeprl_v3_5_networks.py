@@ -1,14 +1,28 @@
-"""What `sheeprl_v3_5_adapter` offers of layers, encoder and decoder, with the given numbers as the parameters of sheeprl's modules.
+"""What `sheeprl_v3_5_adapter` offers of layers, encoder and decoder, with the given numbers as the parameters of
+sheeprl's modules.
 
-Their encoder pools and has no stage at full resolution. Images are channels first there, latents come with the stochastic part first, and
-discrete observations, which they do not have, enter beside the symlog of the vectors, in their encoder without symlog.
+Their encoder pools and has no stage at full resolution. Images are channels first there, latents come with the
+stochastic part first, and discrete observations, which they do not have, enter beside the symlog of the vectors, in
+their encoder without symlog.
 """
 
 import torch
 from sheeprl.algos.dreamer_v3_5 import agent
 from sheeprl.utils.utils import symlog
 
-__all__ = ["block_linear", "decoder", "dense_of", "encoder", "fill", "linear", "max_pool", "mlp_of", "out_of", "rms_norm", "upsample"]
+__all__ = [
+    "block_linear",
+    "decoder",
+    "dense_of",
+    "encoder",
+    "fill",
+    "linear",
+    "max_pool",
+    "mlp_of",
+    "out_of",
+    "rms_norm",
+    "upsample",
+]
 
 
 def fill(module, tensors):
@@ -83,7 +97,9 @@ def encoder(params, observation, spaces, config):
     if vectors:
         inputs = {key: vector_input(observation[key], space) for key, space in vectors.items()}
         widths = [x.shape[-1] for x in inputs.values()]
-        network = agent.MLPEncoder(list(vectors), widths, config.encoder_layers, config.units, eps=config.norm_epsilon, symlog_inputs=False)
+        network = agent.MLPEncoder(
+            list(vectors), widths, config.encoder_layers, config.units, eps=config.norm_epsilon, symlog_inputs=False
+        )
         parts.append(fill(network, mlp_of(params, "encoder/vector", config.encoder_layers))(inputs))
     if images:
         require_pooling(config)
@@ -104,7 +120,10 @@ def vector_input(x, space):
         return symlog(x)
     if x.is_floating_point():
         raise ValueError("discrete observations are whole numbers")
-    hots = (torch.nn.functional.one_hot(entry.long(), count) for entry, count in zip(x.unbind(-1), space.classes, strict=True))
+    hots = (
+        torch.nn.functional.one_hot(entry.long(), count)
+        for entry, count in zip(x.unbind(-1), space.classes, strict=True)
+    )
     return torch.cat([hot.float() for hot in hots], -1)
 
 
@@ -115,7 +134,9 @@ def decoder(params, feature, spaces, config):
     decoded = {}
     if vectors:
         widths = [sum(space.classes) if hasattr(space, "classes") else space.size for space in vectors.values()]
-        network = agent.MLPDecoder(list(vectors), widths, config.feature_size, config.decoder_layers, config.units, eps=config.norm_epsilon)
+        network = agent.MLPDecoder(
+            list(vectors), widths, config.feature_size, config.decoder_layers, config.units, eps=config.norm_epsilon
+        )
         heads = [x for key in vectors for x in out_of(params, f"decoder/vector/out/{key}")]
         decoded |= fill(network, mlp_of(params, "decoder/vector", config.decoder_layers) + heads)(feature)
     if images:
@@ -136,7 +157,8 @@ def decoder(params, feature, spaces, config):
 
 
 def projections_of(params, shape, blocks):
-    """The layers from latents to the first feature maps [channels, height, width], whose outputs are in another order there."""
+    """The layers from latents to the first feature maps [channels, height, width], whose outputs are in another order
+    there."""
     channels, height, width = shape
 
     def of_blocks(x):
@@ -145,6 +167,8 @@ def projections_of(params, shape, blocks):
     def of_all(x):
         return x.unflatten(-1, (height, width, channels)).movedim(-1, -3).flatten(-3)
 
-    deter, stoch = ([params[f"decoder/image/{name}/{part}"] for part in ("kernel", "bias")] for name in ("deter", "stoch"))
+    deter, stoch = (
+        [params[f"decoder/image/{name}/{part}"] for part in ("kernel", "bias")] for name in ("deter", "stoch")
+    )
     memory = [of_blocks(deter[0]), of_blocks(deter[1].unflatten(-1, (blocks, -1))).flatten()]
     return [*memory, *dense_of(params, "decoder/image/stoch_hidden"), of_all(stoch[0]).mT, of_all(stoch[1])]

@@ -1,9 +1,11 @@
-"""TorchRL: the components of its DreamerV3: transforms, RSSM, KL losses, returns, actor and critic losses, optimizer, update ratio.
+"""TorchRL: the components of its DreamerV3: transforms, RSSM, KL losses, returns, actor and critic losses, optimizer,
+update ratio.
 
-Written for torchrl 0.14.1. TorchRL computes norms, returns and moments in float32: check it with `--dtype float32`. Latents are flat there,
-and rows of linear layers are outputs. `torchrl_losses` holds what its loss modules compute. Where a rollout samples, `torch.rand` hands out
-the given noise. What no public function gives (the uniform mixture, sampling, single layers, the returns along a replayed sequence) is
-taken from the functions that TorchRL's own modules call.
+Written for torchrl 0.14.1. TorchRL computes norms, returns and moments in float32: check it with `--dtype float32`.
+Latents are flat there, and rows of linear layers are outputs. `torchrl_losses` holds what its loss modules compute.
+Where a rollout samples, `torch.rand` hands out the given noise. What no public function gives (the uniform mixture,
+sampling, single layers, the returns along a replayed sequence) is taken from the functions that TorchRL's own modules
+call.
 """
 
 import warnings
@@ -88,7 +90,11 @@ def rms_norm(x, scale, epsilon):
 
 
 def dense_state(params, name):
-    return [{"weight": params[f"{name}/kernel"].mT, "bias": params[f"{name}/bias"]}, {"weight": params[f"{name}/scale"]}, {}]
+    return [
+        {"weight": params[f"{name}/kernel"].mT, "bias": params[f"{name}/bias"]},
+        {"weight": params[f"{name}/scale"]},
+        {},
+    ]
 
 
 def head_state(params, name, layers):
@@ -111,7 +117,11 @@ def prior_network(params, config):
     network.rnn_to_prior_projector.load_state_dict(head_state(params, "rssm/prior", config.prior_layers))
     for part, name in (("belief", "embed_deter"), ("state", "embed_stoch"), ("action", "embed_action")):
         getattr(network.rnn, f"{part}_projection").load_state_dict(numbered(dense_state(params, f"rssm/{name}")))
-    hidden = {"0.weight": params["rssm/hidden/kernel"], "0.bias": params["rssm/hidden/bias"], "1.weight": params["rssm/hidden/scale"]}
+    hidden = {
+        "0.weight": params["rssm/hidden/kernel"],
+        "0.bias": params["rssm/hidden/bias"],
+        "1.weight": params["rssm/hidden/scale"],
+    }
     network.rnn.hidden_layers.load_state_dict(hidden)
     network.rnn.gates.load_state_dict({"weight": params["rssm/gru/kernel"], "bias": params["rssm/gru/bias"]})
     return network
@@ -119,7 +129,9 @@ def prior_network(params, config):
 
 def posterior_network(params, config):
     tokens = len(params["rssm/posterior/hidden0/kernel"]) - config.deter
-    network = RSSMPosteriorV3(obs_embed_dim=tokens, use_rms_norm=True, num_layers=config.posterior_layers, **sizes(config))
+    network = RSSMPosteriorV3(
+        obs_embed_dim=tokens, use_rms_norm=True, num_layers=config.posterior_layers, **sizes(config)
+    )
     network.obs_rnn_to_post_projector.load_state_dict(head_state(params, "rssm/posterior", config.posterior_layers))
     return network
 
@@ -149,7 +161,10 @@ def observe(params, carry, tokens, prev_action, is_first, uniform, config):
     rows, steps = is_first.shape
     start = {"state": carry["stoch"].flatten(-2), "belief": carry["deter"]}
     first = {key: torch.cat([x[:, None], x.new_zeros(rows, steps - 1, x.shape[-1])], 1) for key, x in start.items()}
-    data = TensorDict({**first, "action": prev_action, "is_init": is_first[..., None], "next": {"encoded_latents": tokens}}, [rows, steps])
+    data = TensorDict(
+        {**first, "action": prev_action, "is_init": is_first[..., None], "next": {"encoded_latents": tokens}},
+        [rows, steps],
+    )
     noise = uniform.transpose(0, 1)[:, None].expand(-1, 2, -1, -1)
     with mock.patch.object(torch, "rand", return_value=noise):
         result = rollout(data)["next"]
@@ -175,7 +190,9 @@ def kl_losses(posterior_logits, prior_logits, config):
         return categorical_kl_terms(posterior_logits, prior_logits, config.free_nats, config.latent_unimix)
 
     rows = posterior_logits.shape[:-2]
-    dynamics, representation = torch.vmap(one)(*(x.reshape(-1, *x.shape[-2:]) for x in (posterior_logits, prior_logits)))
+    dynamics, representation = torch.vmap(one)(
+        *(x.reshape(-1, *x.shape[-2:]) for x in (posterior_logits, prior_logits))
+    )
     return dynamics.reshape(rows), representation.reshape(rows)
 
 
@@ -229,7 +246,9 @@ def moment_options(config):
 def laprop(gradient, second_moment, momentum, step, config):
     start = torch.zeros_like(gradient)
     rates = {"lr": 1.0, "warmup_steps": 0, "agc": 0.0}
-    (moved,), (second,), (first,) = updated([start], [gradient], [second_moment], [momentum], step, **rates, **moment_options(config))
+    (moved,), (second,), (first,) = updated(
+        [start], [gradient], [second_moment], [momentum], step, **rates, **moment_options(config)
+    )
     return -moved, second, first
 
 
@@ -243,7 +262,9 @@ def optimizer_step(params, gradients, state, config):
     for mapping in (gradients, state["second_moment"], state["momentum"]):
         if set(mapping) != set(params):
             raise ValueError("the names are not those of params")
-    by_name = [[mapping[name] for name in params] for mapping in (params, gradients, state["second_moment"], state["momentum"])]
+    by_name = [
+        [mapping[name] for name in params] for mapping in (params, gradients, state["second_moment"], state["momentum"])
+    ]
     clipping = {"agc": config.agc_clip, "parameter_norm_min": config.agc_epsilon}
     rates = {"lr": config.learning_rate, "warmup_steps": config.warmup_steps}
     new = updated(*by_name, state["step"], **clipping, **rates, **moment_options(config))

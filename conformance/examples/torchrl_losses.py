@@ -1,7 +1,7 @@
 """TorchRL's actor and critic losses, on given numbers. For `torchrl_adapter`.
 
-The loss modules imagine, and ask actor, critic and continuation model. Here all of these are replaced by ones that hand out given numbers:
-an imagined state is the four numbers (value, continuation, log-probability, entropy).
+The loss modules imagine, and ask actor, critic and continuation model. Here all of these are replaced by ones that hand
+out given numbers: an imagined state is the four numbers (value, continuation, log-probability, entropy).
 """
 
 import torch
@@ -63,8 +63,12 @@ def actor_loss_module(state, next_state, reward, discount, lambda_, **options):
     """The loss module and the data of one dream: state and next_state [N, H, 4], reward [N, H]."""
     here, following = ({"state": x, "belief": x} for x in (state, next_state))
     data = TensorDict({**here, "action": state, "next": {**following, "reward": reward[..., None]}}, reward.shape)
-    value, continuation = (TensorDictModule(Column(i), ["state"], [key]) for i, key in ((0, "state_value"), (1, "continuation")))
-    loss = DreamerV3ActorLoss(Policy(), value, Dream(data), continuation_model=continuation, use_reinforce=True, **options)
+    value, continuation = (
+        TensorDictModule(Column(i), ["state"], [key]) for i, key in ((0, "state_value"), (1, "continuation"))
+    )
+    loss = DreamerV3ActorLoss(
+        Policy(), value, Dream(data), continuation_model=continuation, use_reinforce=True, **options
+    )
     loss.make_value_estimator(ValueEstimators.TDLambda, gamma=discount, lmbda=lambda_)
     return loss, data
 
@@ -80,14 +84,18 @@ def lambda_return(reward, continue_, value, discount, lambda_):
 
 
 def cumulative_weights(continue_, discount):
-    return dreamt(torch.zeros_like(continue_), continue_, torch.zeros_like(continue_), discount, 0.95)["discount_weight"][..., 0]
+    return dreamt(torch.zeros_like(continue_), continue_, torch.zeros_like(continue_), discount, 0.95)[
+        "discount_weight"
+    ][..., 0]
 
 
 def actor_loss(log_prob, entropy, returns, value, weight, scale, config):
     def one(log_prob, entropy, returns, value, weight):
         """Of a dream of one step whose reward is the return, after which nothing follows."""
         state = torch.stack([value, weight, log_prob, entropy], -1).reshape(1, 1, 4)
-        module, data = actor_loss_module(state, torch.zeros(1, 1, 4), returns.reshape(1, 1), 1.0, 1.0, entropy_bonus=config.entropy_scale)
+        module, data = actor_loss_module(
+            state, torch.zeros(1, 1, 4), returns.reshape(1, 1), 1.0, 1.0, entropy_bonus=config.entropy_scale
+        )
         module.eval()
         module.retnorm.high.fill_(scale)
         module.retnorm.min_scale = 0.0
@@ -114,7 +122,11 @@ def value_loss_module(config, logits, slow_logits):
         TensorDictModule(SymExpTwoHot(config.bins), ["state_value_logits"], ["state_value"]),
     )
     loss = DreamerV3ValueLoss(
-        network, "two_hot", num_value_bins=config.bins, slow_critic_regularization=config.slow_critic_scale, reduction="none"
+        network,
+        "two_hot",
+        num_value_bins=config.bins,
+        slow_critic_regularization=config.slow_critic_scale,
+        reduction="none",
     )
     if config.slow_critic_scale:
         loss.target_value_model_params["module", "0", "module", "tensors", "logits"].data.copy_(slow_logits)
@@ -134,14 +146,20 @@ def replay_critic_loss(logits, slow_logits, returns, is_last, config):
     here, end = is_last.reshape(steps, 1, 1).bool(), torch.ones(steps, 1, 1, dtype=torch.bool)
     following = {"reward": reward, "done": torch.cat([here, end], 1), "terminated": torch.cat([~end, end], 1)}
     data = TensorDict({"state": reward, "bootstrap": torch.zeros_like(reward), "next": following}, [steps, 2])
-    return value_loss_module(config, logits, slow_logits).replay_value_loss(data)["loss_replay_value"].reshape(is_last.shape)
+    return (
+        value_loss_module(config, logits, slow_logits)
+        .replay_value_loss(data)["loss_replay_value"]
+        .reshape(is_last.shape)
+    )
 
 
 def update_slow_critic(slow, critic, decay):
     critic = {name: x for name, x in critic.items() if name.startswith("critic/")}
     if {name: x.shape for name, x in critic.items()} != {name: x.shape for name, x in slow.items()}:
         raise ValueError("slow must have the names and shapes of the critic")
-    loss = DreamerV3ValueLoss(TensorDictModule(Given(**critic), ["state"], ["state_value"]), slow_critic_regularization=1.0)
+    loss = DreamerV3ValueLoss(
+        TensorDictModule(Given(**critic), ["state"], ["state_value"]), slow_critic_regularization=1.0
+    )
     update = SoftUpdate(loss, eps=decay)
     targets = loss.target_value_model_params["module", "tensors"]
     for name, value in slow.items():

@@ -1,9 +1,9 @@
 """How far two results of a train step are apart, tensor by tensor, and how far they may be.
 
-Tensors of a state are measured against the way they have come: ‖a - b‖ / ‖b - c‖, Euclidean norms over all numbers of a tensor, where b
-is the baseline's and c the state in which both were last the same. 1e-12 means that twelve digits of what training did are the same, 1
-that the two have nothing in common. The way counts as at least a millionth of ‖b‖, far less than one update: where nothing moves, the
-last bit of a stored number must not look like a different way.
+Tensors of a state are measured against the way they have come: ‖a - b‖ / ‖b - c‖, Euclidean norms over all numbers of a
+tensor, where b is the baseline's and c the state in which both were last the same. 1e-12 means that twelve digits of
+what training did are the same, 1 that the two have nothing in common. The way counts as at least a millionth of ‖b‖,
+far less than one update: where nothing moves, the last bit of a stored number must not look like a different way.
 """
 
 import dataclasses
@@ -32,7 +32,8 @@ class Tensor:
 
 
 def deviations(actual: tuple[Nested, Nested], expected: tuple[Nested, Nested], origin: Nested) -> Iterator[Tensor]:
-    """Every tensor of (state, aux) of a train step against the baseline's, in the order of GROUPS; origin: the last common state.
+    """Every tensor of (state, aux) of a train step against the baseline's, in the order of GROUPS; origin: the last
+    common state.
 
     Raises:
       KeyError: a result lacks something.
@@ -42,7 +43,9 @@ def deviations(actual: tuple[Nested, Nested], expected: tuple[Nested, Nested], o
     yield Tensor("latents", "rssm", "deter", beyond_one(aux["deter"], expected_aux["deter"]))
     for name, loss in expected_aux["losses"].items():
         yield Tensor("losses", name.partition("/")[0], f"loss {name}", beyond_one(aux["losses"][name], loss))
-    ends = (np.array([float(x["return_range"][end]) for end in ("low", "high")]) for x in (state, expected_state, origin))
+    ends = (
+        np.array([float(x["return_range"][end]) for end in ("low", "high")]) for x in (state, expected_state, origin)
+    )
     yield Tensor("return range", "critic", "return_range", of_the_way(*ends))
     for group, key in (("second moments", "second_moment"), ("momenta", "momentum")):
         moments = (x["optimizer"][key] for x in (state, expected_state, origin))
@@ -66,7 +69,8 @@ def share_of_others(actual: Any, expected: Any) -> float:
 
 
 def of_the_way(actual: Any, expected: Any, origin: Any) -> float:
-    """‖actual - expected‖ / ‖expected - origin‖; infinite where shapes differ, numbers are not finite, or only one of them left zero."""
+    """‖actual - expected‖ / ‖expected - origin‖; infinite where shapes differ, numbers are not finite, or only one of
+    them left zero."""
     actual, expected, origin = (np.asarray(x, np.float64) for x in (actual, expected, origin))
     if actual.shape != expected.shape:
         return math.inf

@@ -9,7 +9,10 @@ from conformance.lockstep.bounds import bound_of_part
 from conformance.lockstep.drift import GROUPS
 
 STYLES = {
-    **{group: (color, "--") for group, color in zip(GROUPS[1:6], ("#737373", "#111111", "#0d9488", "#9333ea", "#d946ef"), strict=True)},
+    **{
+        group: (color, "--")
+        for group, color in zip(GROUPS[1:6], ("#737373", "#111111", "#0d9488", "#9333ea", "#d946ef"), strict=True)
+    },
     "encoder": ("#1d4ed8", "-"),
     "rssm": ("#0284c7", "-"),
     "decoder": ("#38bdf8", "-"),
@@ -64,11 +67,21 @@ def draw(path: Path, found: dict[str, Any], title: str, bounded: bool) -> None:
 def _draw_curves(axes: Any, steps: list[int], curves: dict[str, list[float | None]]) -> None:
     for group, (color, style) in STYLES.items():
         values = [LARGEST if value is None else min(value, LARGEST) or math.nan for value in curves[group]]
-        axes.plot(steps[: len(values)], values, style, color=color, linewidth=1.4, marker="." if len(values) < 3 else "", label=group)
+        axes.plot(
+            steps[: len(values)],
+            values,
+            style,
+            color=color,
+            linewidth=1.4,
+            marker="." if len(values) < 3 else "",
+            label=group,
+        )
 
 
 def _draw_bounds(axes: Any, steps: list[int], mode: str) -> None:
     for part, name in BOUNDS.items():
         allowed = [bound_of_part(part, step if mode == "free" else 1) for step in steps]
         axes.plot(steps, allowed, ":", color="#525252", linewidth=1.2)
-        axes.annotate(f"bound, {name}", (1, allowed[0]), xytext=(0, 3), textcoords="offset points", fontsize=8, color="#525252")
+        axes.annotate(
+            f"bound, {name}", (1, allowed[0]), xytext=(0, 3), textcoords="offset points", fontsize=8, color="#525252"
+        )

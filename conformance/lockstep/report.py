@@ -12,7 +12,8 @@ POINTS = 48
 
 
 def report(lockstep: Lockstep) -> dict[str, Any]:
-    """What was found on one problem. `steps` are the ends of intervals, and a curve holds the largest deviation in each of them."""
+    """What was found on one problem. `steps` are the ends of intervals, and a curve holds the largest deviation in each
+    of them."""
     ends = interval_ends(lockstep.steps)
     return {
         "baseline": lockstep.baseline,
@@ -29,12 +30,15 @@ def _comparison(comparison: Comparison, ends: list[int]) -> dict[str, Any]:
     exceeded = comparison.exceeded
     return {
         "parted": comparison.parted,
-        "exceeded": exceeded and {"step": exceeded.step, "tensor": exceeded.tensor.name, "deviation": finite(exceeded.tensor.deviation)},
+        "exceeded": exceeded
+        and {"step": exceeded.step, "tensor": exceeded.tensor.name, "deviation": finite(exceeded.tensor.deviation)},
         "worst": {
             group: {"deviation": finite(tensor.deviation), "step": step, "tensor": tensor.name}
             for group, (step, tensor) in comparison.worst.items()
         },
-        "curves": {group: [finite(value) for value in reduce(curve, ends)] for group, curve in comparison.curves.items()},
+        "curves": {
+            group: [finite(value) for value in reduce(curve, ends)] for group, curve in comparison.curves.items()
+        },
     }
 
 
@@ -50,14 +54,22 @@ def reduce(curve: list[float], ends: list[int]) -> list[float]:
 
 
 def failures(lockstep: Lockstep) -> list[str]:
-    """One line for each comparison that is beyond its bound, or whose samples parted in float64; empty below float64."""
+    """One line for each comparison that is beyond its bound, or whose samples parted in float64; empty below
+    float64."""
     lines = []
     for name, modes in lockstep.comparisons.items():
         for mode, comparison in modes.items():
             where = f"{name} against {lockstep.baseline}, {mode}"
             if exceeded := comparison.exceeded:
-                deviation = f"{exceeded.tensor.deviation:.1e}" if math.isfinite(exceeded.tensor.deviation) else "without limit"
-                lines.append(f"{where}: step {exceeded.step}, {exceeded.tensor.name} deviates {deviation}, allowed {exceeded.bound:.1e}")
+                deviation = (
+                    f"{exceeded.tensor.deviation:.1e}" if math.isfinite(exceeded.tensor.deviation) else "without limit"
+                )
+                lines.append(
+                    f"{where}: step {exceeded.step}, {exceeded.tensor.name} deviates "
+                    f"{deviation}, allowed {exceeded.bound:.1e}"
+                )
             elif comparison.parted and lockstep.dtype == "float64":
-                lines.append(f"{where}: step {comparison.parted}, a sample of the drifted state falls into another class")
+                lines.append(
+                    f"{where}: step {comparison.parted}, a sample of the drifted state falls into another class"
+                )
     return lines

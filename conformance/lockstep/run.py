@@ -21,8 +21,8 @@ from spec import parameter_table
 
 PROBLEMS = {"vector": ("vector", "discrete"), "image": ("image", "continuous")}
 MODES = ("free", "one step")
-# How near a uniform number may come to a threshold of its sample. Far above what the states in lockstep differ by; in bfloat16 a thousand
-# samples cannot all keep away from where rounding moves the thresholds.
+# How near a uniform number may come to a threshold of its sample. Far above what the states in lockstep differ by; in
+# bfloat16 a thousand samples cannot all keep away from where rounding moves the thresholds.
 MARGIN = {"float64": 1e-6, "float32": 1e-5, "bfloat16": 0.0}
 ATTEMPTS = 200
 
@@ -40,8 +40,10 @@ class Exceeded:
 class Comparison:
     """One member against the baseline, either running free or from a common state at every step.
 
-    curves: group -> deviation of its worst tensor, an entry for each step. worst: group -> (step, tensor) of the largest of them.
-    parted: the step, counted from 1, at which a sample of a free run fell into another class; nothing is compared from then on.
+    curves: group -> deviation of its worst tensor, an entry for each step. worst: group -> (step, tensor) of the
+    largest of them.
+    parted: the step, counted from 1, at which a sample of a free run fell into another class; nothing is compared from
+    then on.
     """
 
     curves: dict[str, list[float]] = dataclasses.field(default_factory=lambda: {group: [] for group in GROUPS})
@@ -64,8 +66,8 @@ class Comparison:
 class Lockstep:
     """Members side by side on one problem.
 
-    members: name -> adapter; the reference is the baseline if it takes part, and else the first. A member without `train_step` is given
-    the gradients of the first that has them, and needs `train_step_with`.
+    members: name -> adapter; the reference is the baseline if it takes part, and else the first. A member without
+    `train_step` is given the gradients of the first that has them, and needs `train_step_with`.
 
     Raises:
       UserError: fewer than two members, or one that cannot make a train step.
@@ -77,13 +79,18 @@ class Lockstep:
         self.dtype = dtype
         self.task, self.config = spaces(*PROBLEMS[problem]), lockstep_config(profile, dtype)
         self.members = dict(members)
-        self.supplier = next((adapter for adapter in members.values() if callable(getattr(adapter, "gradients", None))), None)
+        self.supplier = next(
+            (adapter for adapter in members.values() if callable(getattr(adapter, "gradients", None))), None
+        )
         for name, adapter in members.items():
             if not callable(getattr(adapter, "train_step", None)):
                 if not callable(getattr(adapter, "train_step_with", None)):
                     raise UserError(f"{name} offers neither train_step nor train_step_with; see conformance/adapter.py")
                 if self.supplier is None:
-                    raise UserError(f"{name} has no gradients of its own, and no other backend offers any; add one that does, such as jax")
+                    raise UserError(
+                        f"{name} has no gradients of its own, and no other backend offers any; "
+                        f"add one that does, such as jax"
+                    )
         self.baseline = "numpy" if "numpy" in members else next(iter(members))
         self.others = [name for name in members if name != self.baseline]
         self.comparisons = {name: {mode: Comparison() for mode in MODES} for name in self.others}
@@ -104,7 +111,9 @@ class Lockstep:
             self._compare(one, name, self._advance(name, common, batch, noise), expected, common, 1)
             if free.parted is None:
                 own = self._states[name]
-                if any(not np.array_equal(a, b) for a, b in zip(self._samples(own, batch, noise)[0], samples, strict=True)):
+                if any(
+                    not np.array_equal(a, b) for a, b in zip(self._samples(own, batch, noise)[0], samples, strict=True)
+                ):
                     free.parted = self.steps
                     continue
                 actual = self._advance(name, own, batch, noise)
@@ -115,7 +124,9 @@ class Lockstep:
         self._states[self.baseline] = expected[0]
         self._stream.store(expected[1]["deter"], expected[1]["stoch"])
 
-    def _compare(self, comparison: Comparison, name: str, actual: Any, expected: Any, origin: Nested, together: int) -> None:
+    def _compare(
+        self, comparison: Comparison, name: str, actual: Any, expected: Any, origin: Nested, together: int
+    ) -> None:
         with _complete(name):
             tensors = list(deviations(actual, expected, origin))
         comparison.add(self.steps, tensors, lambda tensor: bound(tensor, together, self.dtype))
@@ -141,13 +152,14 @@ class Lockstep:
                 return noise, samples
             self.redrawn += 1
         raise UserError(
-            f"step {self.steps + 1}: no noise of {ATTEMPTS} keeps every sample {MARGIN[self.dtype]:g} away from the next class; "
+            f"step {self.steps + 1}: no noise of {ATTEMPTS} keeps every sample "
+            f"{MARGIN[self.dtype]:g} away from the next class; "
             f"does the state of {self.baseline} hold numbers that are not finite?"
         )
 
     def _samples(self, state: Nested, batch: Arrays, noise: Arrays) -> tuple[list[np.ndarray], float]:
-        """Every categorical sample that the reference draws at a state, imagined ones as well, and the smallest distance of a uniform
-        number from a threshold."""
+        """Every categorical sample that the reference draws at a state, imagined ones as well, and the smallest
+        distance of a uniform number from a threshold."""
         samples: list[np.ndarray] = []
         margins = [math.inf]
         right = distributions.categorical_sample
@@ -169,7 +181,9 @@ class Lockstep:
     def _fresh_state(self, seed: int) -> Nested:
         """The beginning of a run: reward and critic predict 0, moments are 0."""
         rng, table = np.random.default_rng([seed, 1]), parameter_table(self.config, self.task)
-        uniforms = {name: rng.random(entry.shape) for name, entry in table.items() if entry.initializer == "truncated_normal"}
+        uniforms = {
+            name: rng.random(entry.shape) for name, entry in table.items() if entry.initializer == "truncated_normal"
+        }
         params = agent.initial_parameters(table, uniforms)
         stored = "float64" if self.dtype == "float64" else "float32"
         return agent.initial_state({name: round_to(value, stored) for name, value in params.items()})
@@ -181,7 +195,9 @@ def _complete(name: str) -> Iterator[None]:
     try:
         yield
     except KeyError as error:
-        raise UserError(f"{name}: the result of a train step lacks {error}; [AGT] in spec/10-agent.md says what belongs there") from error
+        raise UserError(
+            f"{name}: the result of a train step lacks {error}; [AGT] in spec/10-agent.md says what belongs there"
+        ) from error
 
 
 def _plain(state: Nested) -> Nested:

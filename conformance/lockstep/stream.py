@@ -1,8 +1,9 @@
 """The data of a lockstep: a small process that can be learned, as B streams that run on from batch to batch.
 
-A wheel is turned by pushes. What is seen tells its angle and speed, the reward is highest where the angle is 0, and the rows of a batch
-end both ways: a wheel that is too fast breaks (terminal), and any episode may run out of time (not terminal). Whoever pushes gets more
-skilful over the steps of training, so that rewards, episode lengths and returns move as they do in a run.
+A wheel is turned by pushes. What is seen tells its angle and speed, the reward is highest where the angle is 0, and the
+rows of a batch end both ways: a wheel that is too fast breaks (terminal), and any episode may run out of time (not
+terminal). Whoever pushes gets more skilful over the steps of training, so that rewards, episode lengths and returns
+move as they do in a run.
 """
 
 import math
@@ -39,7 +40,8 @@ def lockstep_config(profile: str, dtype: str) -> Config:
 
 
 class Stream:
-    """Batches of a replay whose sequences follow on each other. Everything is a function of the seed and of the calls made."""
+    """Batches of a replay whose sequences follow on each other. Everything is a function of the seed and of the calls
+    made."""
 
     def __init__(self, seed: int, spaces: Spaces, config: Config) -> None:
         self._rng = np.random.default_rng(seed)
@@ -59,7 +61,8 @@ class Stream:
         return {name: np.stack([record[name] for record in records], 1) for name in records[0]} | self._latents
 
     def store(self, deter: np.ndarray, stoch: np.ndarray) -> None:
-        """Latents [B, T, ...] of the batch before; the last of them are the context of the next, as replay would give them."""
+        """Latents [B, T, ...] of the batch before; the last of them are the context of the next, as replay would give
+        them."""
         self._latents = {"deter": deter[:, -1].astype(np.float32), "stoch": stoch[:, -1].argmax(-1)}
 
     def noise(self) -> Arrays:
@@ -98,12 +101,18 @@ class Stream:
         rows, observation = len(self._angle), {}
         for key, space in self._spaces.observations.items():
             if isinstance(space, Discrete):
-                sector = ((self._angle + math.pi) / (2 * math.pi) * space.classes[0]).astype(int).clip(0, space.classes[0] - 1)
+                sector = (
+                    ((self._angle + math.pi) / (2 * math.pi) * space.classes[0])
+                    .astype(int)
+                    .clip(0, space.classes[0] - 1)
+                )
                 observation[key] = np.stack([sector, (self._speed > 0).astype(int)], -1)
             elif key == "image":
                 observation[key] = self._picture(space.array_shape)
             else:
-                observation[key] = np.stack([np.cos(self._angle), np.sin(self._angle), 10 * self._speed], -1).astype(np.float32)
+                observation[key] = np.stack([np.cos(self._angle), np.sin(self._angle), 10 * self._speed], -1).astype(
+                    np.float32
+                )
             assert observation[key].shape == (rows, *space.array_shape)
         return observation
 
@@ -133,4 +142,8 @@ class Stream:
             classes = space.classes[0]
             nearest = np.round((wanted + 1) / 2 * (classes - 1)).astype(int)
             return np.eye(classes)[np.where(skilled, nearest, rng.integers(0, classes, rows))]
-        return np.where(skilled[:, None], wanted[:, None] + 0.1 * rng.normal(size=(rows, space.size)), rng.normal(size=(rows, space.size)))
+        return np.where(
+            skilled[:, None],
+            wanted[:, None] + 0.1 * rng.normal(size=(rows, space.size)),
+            rng.normal(size=(rows, space.size)),
+        )

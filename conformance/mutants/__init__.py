@@ -22,6 +22,19 @@ from conformance.mutants.trial import relevant, sound, trial
 
 __all__ = ["MUTANTS", "Mutant", "MutantAdapter", "PlantedAdapter", "planted", "relevant", "sound", "trial"]
 
-_ROWS = (transforms, distributions, layers, rssm, networks, world_model, returns, behavior, optimizer, agent, replay, training_loop)
+_ROWS = (
+    transforms,
+    distributions,
+    layers,
+    rssm,
+    networks,
+    world_model,
+    returns,
+    behavior,
+    optimizer,
+    agent,
+    replay,
+    training_loop,
+)
 
 MUTANTS: dict[str, Mutant] = {mutant.name: mutant for row in _ROWS for mutant in row.MUTANTS}

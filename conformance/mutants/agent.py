@@ -14,7 +14,9 @@ MUTANTS = (
         fix="Count the inputs of all blocks.",
         edits={
             "agent.initial_parameters": {
-                "entry.fan_in, entry.outscale": "entry.shape[1] if len(entry.shape) == 3 else entry.fan_in, entry.outscale"
+                "entry.fan_in, entry.outscale": (
+                    "entry.shape[1] if len(entry.shape) == 3 else entry.fan_in, entry.outscale"
+                )
             }
         },
     ),
@@ -24,11 +26,17 @@ MUTANTS = (
         provenance="2023 edition, NM512/dreamerv3-torch and sheeprl (D-77)",
         violates=("AGT-5", "LAY-10"),
         fix="Scale by the fan-in.",
-        edits={"agent.initial_parameters": {"entry.fan_in, entry.outscale": "(entry.fan_in + entry.shape[-1]) // 2, entry.outscale"}},
+        edits={
+            "agent.initial_parameters": {
+                "entry.fan_in, entry.outscale": "(entry.fan_in + entry.shape[-1]) // 2, entry.outscale"
+            }
+        },
     ),
     Mutant(
         name="reward_and_value_start_random",
-        explanation="reward head and critic do not start at zero, so that first predictions are as large as the outermost bins",
+        explanation=(
+            "reward head and critic do not start at zero, so that first predictions are as large as the outermost bins"
+        ),
         provenance="navix; sheeprl until issue 130",
         violates=("AGT-6", "NET-20"),
         fix="Start the output kernels of reward head and critic at zero.",
@@ -40,7 +48,9 @@ MUTANTS = (
         provenance="2023 edition (D-69)",
         violates=("AGT-6",),
         fix="Start the actor's output kernels with an outscale of 0.01.",
-        edits={"agent.initial_parameters": {"entry.outscale)": 'max(entry.outscale, float(name.startswith("actor/"))))'}},
+        edits={
+            "agent.initial_parameters": {"entry.outscale)": 'max(entry.outscale, float(name.startswith("actor/"))))'}
+        },
     ),
     Mutant(
         name="slow_critic_starts_at_zero",
@@ -95,8 +105,12 @@ MUTANTS = (
         fix="Start one trajectory at every step.",
         edits={
             "agent.losses": {
-                'stop_gradient(states["deter"]).reshape(': 'stop_gradient(np.repeat(states["deter"][:, -1:], length, axis=1)).reshape(',
-                'stop_gradient(states["stoch"]).reshape(': 'stop_gradient(np.repeat(states["stoch"][:, -1:], length, axis=1)).reshape(',
+                'stop_gradient(states["deter"]).reshape(': (
+                    'stop_gradient(np.repeat(states["deter"][:, -1:], length, axis=1)).reshape('
+                ),
+                'stop_gradient(states["stoch"]).reshape(': (
+                    'stop_gradient(np.repeat(states["stoch"][:, -1:], length, axis=1)).reshape('
+                ),
             }
         },
     ),
@@ -138,7 +152,11 @@ MUTANTS = (
         provenance="plausible",
         violates=("AGT-22", "RET-15"),
         fix="Update the range first.",
-        edits={"agent.losses": {"return_scale(low, high, config.return_limit)": "return_scale(*return_range, config.return_limit)"}},
+        edits={
+            "agent.losses": {
+                "return_scale(low, high, config.return_limit)": "return_scale(*return_range, config.return_limit)"
+            }
+        },
     ),
     Mutant(
         name="actor_scored_at_the_outcome",
@@ -147,7 +165,11 @@ MUTANTS = (
         violates=("BEH-11", "AGT-23"),
         fix="Score the action at the state where it was chosen.",
         edits={
-            "agent.losses": {"networks.actor(params, acting, spaces, config)": "networks.actor(params, features[:, 1:], spaces, config)"}
+            "agent.losses": {
+                "networks.actor(params, acting, spaces, config)": (
+                    "networks.actor(params, features[:, 1:], spaces, config)"
+                )
+            }
         },
     ),
     Mutant(
@@ -164,7 +186,9 @@ MUTANTS = (
         provenance="naivoder's implementation",
         violates=("AGT-24",),
         fix="Divide the advantages of the actor alone.",
-        edits={"agent.losses": {"slow_logits, returns, weight, config)": "slow_logits, returns / scale, weight, config)"}},
+        edits={
+            "agent.losses": {"slow_logits, returns, weight, config)": "slow_logits, returns / scale, weight, config)"}
+        },
     ),
     Mutant(
         name="replayed_return_from_the_critic",
@@ -193,10 +217,14 @@ MUTANTS = (
     Mutant(
         name="replay_mask_of_another_row",
         explanation="the ends of episodes are those of another sequence of the batch",
-        provenance="plausible; NM512/dreamerv3-torch cut the batch in place of the time until commit 52782d3 (pull request 6)",
+        provenance=(
+            "plausible; NM512/dreamerv3-torch cut the batch in place of the time until commit 52782d3 (pull request 6)"
+        ),
         violates=("BEH-14", "AGT-25"),
         fix="The axes are batch and time, in this order.",
-        edits={"agent.losses": {'np.asarray(batch["is_last"])[:, :-1]': 'np.roll(batch["is_last"], 1, axis=0)[:, :-1]'}},
+        edits={
+            "agent.losses": {'np.asarray(batch["is_last"])[:, :-1]': 'np.roll(batch["is_last"], 1, axis=0)[:, :-1]'}
+        },
     ),
     Mutant(
         name="replay_critic_does_not_train_the_model",
@@ -204,7 +232,11 @@ MUTANTS = (
         provenance="plausible: the paper does not say where it ends (D-32)",
         violates=("BEH-15", "AGT-28"),
         fix="Let the critic read replayed states with their gradient.",
-        edits={"agent.losses": {"networks.critic(params, replayed, config)": "networks.critic(params, stop_gradient(replayed), config)"}},
+        edits={
+            "agent.losses": {
+                "networks.critic(params, replayed, config)": "networks.critic(params, stop_gradient(replayed), config)"
+            }
+        },
     ),
     Mutant(
         name="slow_target_moves_the_model",
@@ -214,7 +246,9 @@ MUTANTS = (
         fix="Take the slow critic's mean as a constant.",
         edits={
             "behavior._regularized_value_loss": {
-                "slow_mean = stop_gradient(symexp_twohot_mean(slow_logits, bins))": "slow_mean = symexp_twohot_mean(slow_logits, bins)"
+                (
+                    "slow_mean = stop_gradient(symexp_twohot_mean(slow_logits, bins))"
+                ): "slow_mean = symexp_twohot_mean(slow_logits, bins)"
             },
             "distributions.symexp_twohot_loss": {"stop_gradient(checked(": "(checked("},
             "agent.losses": {"stop_gradient(replayed)": "replayed"},
@@ -242,7 +276,11 @@ MUTANTS = (
         provenance="the paper's printed sums (D-11); TorchRL until issue 4119",
         violates=("AGT-26",),
         fix="Average every loss over all of its elements.",
-        edits={"agent.losses": {"float(np.mean(value)) if value.size": "float(np.mean(value) * value.shape[1]) if value.size"}},
+        edits={
+            "agent.losses": {
+                "float(np.mean(value)) if value.size": "float(np.mean(value) * value.shape[1]) if value.size"
+            }
+        },
     ),
     Mutant(
         name="dynamics_loss_weighted_by_half",
@@ -284,7 +322,9 @@ MUTANTS = (
         fix="Update the slow critic in every train step.",
         edits={
             "agent.train_step": {
-                "params, config.slow_critic_decay)": 'params, 1.0 if optimizer["step"] % 32 else config.slow_critic_decay)'
+                "params, config.slow_critic_decay)": (
+                    'params, 1.0 if optimizer["step"] % 32 else config.slow_critic_decay)'
+                )
             }
         },
     ),

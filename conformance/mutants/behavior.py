@@ -14,7 +14,9 @@ MUTANTS = (
         edits={
             "behavior.sample_action": {
                 "normal_sample(mean, std, own)": "normal_sample(mean, std, 0.0 * own)",
-                "categorical_sample(log_probs, own[..., entry])": "np.eye(log_probs.shape[-1])[np.argmax(log_probs, axis=-1)]",
+                "categorical_sample(log_probs, own[..., entry])": (
+                    "np.eye(log_probs.shape[-1])[np.argmax(log_probs, axis=-1)]"
+                ),
             }
         },
     ),
@@ -44,7 +46,9 @@ MUTANTS = (
         provenance="plausible",
         violates=("BEH-7",),
         fix="Sum over the dimensions.",
-        edits={"behavior.action_entropy": {"np.sum(normal_entropy(std), axis=-1)": "np.mean(normal_entropy(std), axis=-1)"}},
+        edits={
+            "behavior.action_entropy": {"np.sum(normal_entropy(std), axis=-1)": "np.mean(normal_entropy(std), axis=-1)"}
+        },
     ),
     Mutant(
         name="entropy_minimized",
@@ -60,7 +64,11 @@ MUTANTS = (
         provenance="plausible",
         violates=("BEH-9",),
         fix="Weight score and entropy alike.",
-        edits={"behavior.actor_loss": {_ACTOR: "-(stop_gradient(weight) * advantage * log_prob + config.entropy_scale * entropy)"}},
+        edits={
+            "behavior.actor_loss": {
+                _ACTOR: "-(stop_gradient(weight) * advantage * log_prob + config.entropy_scale * entropy)"
+            }
+        },
     ),
     Mutant(
         name="entropy_divided_by_the_scale",
@@ -96,7 +104,8 @@ MUTANTS = (
             "behavior.actor_loss": {
                 "advantage = stop_gradient((returns - value) / scale)": (
                     "difference = returns - value\n"
-                    "    advantage = stop_gradient((difference - difference.mean()) / (difference.std() + 1e-8) + 0.0 * scale)"
+                    "    advantage = stop_gradient((difference - difference.mean()) / "
+                    "(difference.std() + 1e-8) + 0.0 * scale)"
                 )
             }
         },
@@ -147,7 +156,8 @@ MUTANTS = (
             "behavior._regularized_value_loss": {
                 "towards_slow = symexp_twohot_loss(logits, slow_mean, bins)": (
                     "slow = np.exp(unimix_log_probs(slow_logits, 0.0))\n"
-                    "    towards_slow = -np.sum(stop_gradient(slow) * unimix_log_probs(logits, 0.0), axis=-1) + 0.0 * slow_mean"
+                    "    towards_slow = -np.sum(stop_gradient(slow) * unimix_log_probs(logits, "
+                    "0.0), axis=-1) + 0.0 * slow_mean"
                 )
             }
         },
@@ -160,7 +170,9 @@ MUTANTS = (
         fix="Take the mean of the slow critic, as a constant.",
         edits={
             "behavior._regularized_value_loss": {
-                "slow_mean = stop_gradient(symexp_twohot_mean(slow_logits, bins))": "slow_mean = symexp_twohot_mean(logits, bins)"
+                (
+                    "slow_mean = stop_gradient(symexp_twohot_mean(slow_logits, bins))"
+                ): "slow_mean = symexp_twohot_mean(logits, bins)"
             }
         },
     ),

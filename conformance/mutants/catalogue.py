@@ -1,7 +1,8 @@
 """What a mutant is, and how it is planted.
 
-A mutant is the reference with a few words of its source changed: a realistic mistake as data. `MutantAdapter` is the reference with the
-mistake, in effect only while the candidate is called, so that a check compares the mutant with the unharmed reference.
+A mutant is the reference with a few words of its source changed: a realistic mistake as data. `MutantAdapter` is the
+reference with the mistake, in effect only while the candidate is called, so that a check compares the mutant with the
+unharmed reference.
 """
 
 import contextlib
@@ -23,9 +24,9 @@ Replacements = Mapping[str, Callable[..., Any]]
 class Mutant:
     """One mistake.
 
-    name: what it is called. explanation: what the wrong code does. provenance: who made the mistake, or where it stands. violates:
-    requirement ids, the chapter of the first is the mutant's. fix: what to do about it. edits: "row.function" or "row.Class" of the
-    reference -> {right: wrong}, each text once in the source.
+    name: what it is called. explanation: what the wrong code does. provenance: who made the mistake, or where it
+    stands. violates: requirement ids, the chapter of the first is the mutant's. fix: what to do about it. edits:
+    "row.function" or "row.Class" of the reference -> {right: wrong}, each text once in the source.
     """
 
     name: str

@@ -6,7 +6,9 @@ MUTANTS = (
     Mutant(
         name="no_unimix",
         explanation="the latents and the actor have no uniform mixture",
-        provenance="plausible: danijar/dreamerv3 sets it and leaves it out for discrete actors since December 2024 (issue 219)",
+        provenance=(
+            "plausible: danijar/dreamerv3 sets it and leaves it out for discrete actors since December 2024 (issue 219)"
+        ),
         violates=("DIS-5",),
         fix="Mix 1 % of the uniform distribution into the probabilities of posterior, prior and actor.",
         edits={"distributions.unimix_log_probs": {"if unimix == 0:": "if True:"}},
@@ -78,7 +80,9 @@ MUTANTS = (
         fix="Sum over the classes.",
         edits={
             "distributions.categorical_entropy": {
-                "-np.sum(_product(np.exp(log_probs), log_probs), axis=-1)": "-np.mean(_product(np.exp(log_probs), log_probs), axis=-1)"
+                "-np.sum(_product(np.exp(log_probs), log_probs), axis=-1)": (
+                    "-np.mean(_product(np.exp(log_probs), log_probs), axis=-1)"
+                )
             }
         },
     ),
@@ -126,7 +130,12 @@ MUTANTS = (
         provenance="plausible: a loss for classes; no difference unless targets are discounted",
         violates=("DIS-16",),
         fix="Take the target as it is: it may lie between 0 and 1.",
-        edits={"distributions.bernoulli_loss": {"target = stop_gradient(": "target = np.round(", "*logit.shape))": "*logit.shape))"}},
+        edits={
+            "distributions.bernoulli_loss": {
+                "target = stop_gradient(": "target = np.round(",
+                "*logit.shape))": "*logit.shape))",
+            }
+        },
     ),
     Mutant(
         name="continue_is_the_mode",
@@ -136,7 +145,9 @@ MUTANTS = (
         fix="Use the sigmoid of the logit.",
         edits={
             "distributions.bernoulli_mean": {
-                'return _sigmoid(checked("logit", logit, ...))': "return np.where(np.isnan(logit), np.nan, np.asarray(logit) > 0.0)"
+                'return _sigmoid(checked("logit", logit, ...))': (
+                    "return np.where(np.isnan(logit), np.nan, np.asarray(logit) > 0.0)"
+                )
             }
         },
     ),
@@ -149,7 +160,8 @@ MUTANTS = (
         edits={
             "distributions.bernoulli_mean": {
                 'return _sigmoid(checked("logit", logit, ...))': (
-                    "logit = np.asarray(logit, dtype=np.float64)\n    return np.where(np.isnan(logit) | (logit == 0), np.nan, logit > 0.0)"
+                    "logit = np.asarray(logit, dtype=np.float64)\n    return np.where(np.isnan(logit) | (logit "
+                    "== 0), np.nan, logit > 0.0)"
                 )
             }
         },
@@ -160,11 +172,16 @@ MUTANTS = (
         provenance="naivoder's implementation; TorchRL used logits of reward and value as numbers (issue 4066)",
         violates=("DIS-18", "RET-3"),
         fix="Use the sigmoid of the logit.",
-        edits={"distributions.bernoulli_mean": {'_sigmoid(checked("logit", logit, ...))': 'checked("logit", logit, ...)'}},
+        edits={
+            "distributions.bernoulli_mean": {'_sigmoid(checked("logit", logit, ...))': 'checked("logit", logit, ...)'}
+        },
     ),
     Mutant(
         name="std_without_offset",
-        explanation="the standard deviation of continuous actions lacks the + 2 before its sigmoid, so that a fresh policy explores less",
+        explanation=(
+            "the standard deviation of continuous actions lacks the + 2 before its sigmoid, "
+            "so that a fresh policy explores less"
+        ),
         provenance="the paper does not mention it (D-66)",
         violates=("DIS-19", "BEH-4"),
         fix="Add 2 to the raw output before the sigmoid.",
@@ -176,7 +193,11 @@ MUTANTS = (
         provenance="sheeprl until issue 224, after DreamerV2",
         violates=("DIS-19", "BEH-4"),
         fix="Scale a sigmoid into the bounds: (max - min) sigmoid(x + 2) + min.",
-        edits={"distributions.bounded_normal": {"(max_std - min_std) * _sigmoid(std + 2.0) + min_std": "_softplus(std) + min_std"}},
+        edits={
+            "distributions.bounded_normal": {
+                "(max_std - min_std) * _sigmoid(std + 2.0) + min_std": "_softplus(std) + min_std"
+            }
+        },
     ),
     Mutant(
         name="mean_without_tanh",
@@ -188,19 +209,27 @@ MUTANTS = (
     ),
     Mutant(
         name="action_clipped_when_sampled",
-        explanation="sampled actions are clipped to [-1, 1], so that the score belongs to another action than the one that was drawn",
+        explanation=(
+            "sampled actions are clipped to [-1, 1], so that the score belongs to another "
+            "action than the one that was drawn"
+        ),
         provenance="plausible; the environment's action is clipped, the sample is not (D-67)",
         violates=("DIS-20", "CON-27"),
         fix="Store and score the raw sample, and clip what the environment gets.",
         edits={
             "distributions.normal_sample": {
-                'mean + std * checked("normal", normal, *mean.shape)': 'np.clip(mean + std * checked("normal", normal, *mean.shape), -1, 1)'
+                'mean + std * checked("normal", normal, *mean.shape)': (
+                    'np.clip(mean + std * checked("normal", normal, *mean.shape), -1, 1)'
+                )
             }
         },
     ),
     Mutant(
         name="log_density_without_log_std",
-        explanation="the log-density of a normal leaves out the logarithm of the standard deviation, so that the score pushes it apart",
+        explanation=(
+            "the log-density of a normal leaves out the logarithm of the standard "
+            "deviation, so that the score pushes it apart"
+        ),
         provenance="plausible: a squared error in place of a density",
         violates=("DIS-21",),
         fix="Subtract log(std).",
@@ -246,7 +275,8 @@ MUTANTS = (
         edits={
             "distributions.symlog_mse_loss": {
                 "return scale * (prediction - symlog(target)) ** 2": (
-                    "square = (prediction - symlog(target)) ** 2\n        return scale * np.where(square < 1e-8, 0.0, square)"
+                    "square = (prediction - symlog(target)) ** 2\n        return scale * "
+                    "np.where(square < 1e-8, 0.0, square)"
                 )
             }
         },

@@ -17,7 +17,11 @@ MUTANTS = (
         provenance="2023 edition, NM512/dreamerv3-torch and sheeprl",
         violates=("LAY-4",),
         fix="Divide by the root mean square and subtract nothing.",
-        edits={"layers.rms_norm": {"mean_square = np.mean(": "x = x - np.mean(x, axis=-1, keepdims=True)\n    mean_square = np.mean("}},
+        edits={
+            "layers.rms_norm": {
+                "mean_square = np.mean(": "x = x - np.mean(x, axis=-1, keepdims=True)\n    mean_square = np.mean("
+            }
+        },
     ),
     Mutant(
         name="norm_epsilon_outside_the_root",
@@ -41,7 +45,9 @@ MUTANTS = (
         provenance="DreamerV1 and V2",
         violates=("LAY-5",),
         fix="Use SiLU: x times its sigmoid.",
-        edits={"layers.silu": {"return x / (1.0 + np.exp(-x))": "return np.where(x > 0, x, np.expm1(np.minimum(x, 0.0)))"}},
+        edits={
+            "layers.silu": {"return x / (1.0 + np.exp(-x))": "return np.where(x > 0, x, np.expm1(np.minimum(x, 0.0)))"}
+        },
     ),
     Mutant(
         name="kernel_flipped",
@@ -67,7 +73,9 @@ MUTANTS = (
         fix="Input i and tap k add to output 2i + k - 1.",
         edits={
             "layers.transposed_convolution": {
-                "padded[..., 1 : 1 + 2 * height, 1 : 1 + 2 * width, :]": "padded[..., 2 : 2 + 2 * height, 2 : 2 + 2 * width, :]"
+                (
+                    "padded[..., 1 : 1 + 2 * height, 1 : 1 + 2 * width, :]"
+                ): "padded[..., 2 : 2 + 2 * height, 2 : 2 + 2 * width, :]"
             }
         },
     ),
@@ -78,7 +86,11 @@ MUTANTS = (
         violates=("LAY-8",),
         fix="Linear, then norm, then activation.",
         edits={
-            "layers.dense": {'silu(rms_norm(x, params[f"{name}/scale"], epsilon))': 'rms_norm(silu(x), params[f"{name}/scale"], epsilon)'}
+            "layers.dense": {
+                (
+                    'silu(rms_norm(x, params[f"{name}/scale"], epsilon))'
+                ): 'rms_norm(silu(x), params[f"{name}/scale"], epsilon)'
+            }
         },
     ),
     Mutant(

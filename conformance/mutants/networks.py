@@ -9,7 +9,11 @@ MUTANTS = (
         provenance="the decoder of danijar/dreamerv3 reads it so (D-31)",
         violates=("NET-1", "CON-4"),
         fix="Concatenate memory and latents.",
-        edits={"networks.feature": {"[deter, stoch.reshape(*stoch.shape[:-2], -1)]": "[stoch.reshape(*stoch.shape[:-2], -1), deter]"}},
+        edits={
+            "networks.feature": {
+                "[deter, stoch.reshape(*stoch.shape[:-2], -1)]": "[stoch.reshape(*stoch.shape[:-2], -1), deter]"
+            }
+        },
     ),
     Mutant(
         name="vectors_enter_raw",
@@ -17,7 +21,11 @@ MUTANTS = (
         provenance="plausible",
         violates=("NET-3",),
         fix="Pass vectors through symlog.",
-        edits={"networks._encode_vector": {"symlog(np.asarray(value, dtype=np.float64))": "np.asarray(value, dtype=np.float64)"}},
+        edits={
+            "networks._encode_vector": {
+                "symlog(np.asarray(value, dtype=np.float64))": "np.asarray(value, dtype=np.float64)"
+            }
+        },
     ),
     Mutant(
         name="images_without_offset",
@@ -25,15 +33,23 @@ MUTANTS = (
         provenance="sheeprl until issue 214, NM512/dreamerv3-torch until commit a9e85e8",
         violates=("NET-6",),
         fix="Subtract 1/2 from the scaled image, in the encoder only.",
-        edits={"networks.encoder": {"scaled_image(key, observations[key]) - 0.5": "scaled_image(key, observations[key])"}},
+        edits={
+            "networks.encoder": {"scaled_image(key, observations[key]) - 0.5": "scaled_image(key, observations[key])"}
+        },
     ),
     Mutant(
         name="images_not_scaled",
         explanation="the encoder reads the bytes of images as numbers up to 255",
-        provenance="the DreamerV2 port in PyTorch by jsikyoon (issue 11), when acting: a tensor that forgot it was of bytes",
+        provenance=(
+            "the DreamerV2 port in PyTorch by jsikyoon (issue 11), when acting: a tensor that forgot it was of bytes"
+        ),
         violates=("NET-6",),
         fix="Divide by 255, in training and in acting.",
-        edits={"networks.encoder": {"scaled_image(key, observations[key]) - 0.5": "255.0 * scaled_image(key, observations[key]) - 0.5"}},
+        edits={
+            "networks.encoder": {
+                "scaled_image(key, observations[key]) - 0.5": "255.0 * scaled_image(key, observations[key]) - 0.5"
+            }
+        },
     ),
     Mutant(
         name="stem_blocks_side_by_side",

@@ -16,7 +16,8 @@ MUTANTS = (
                 "length, size = _norm(gradient), _norm(parameter)": (
                     "if gradient.ndim > 1:\n"
                     "        units = zip(np.moveaxis(gradient, -1, 0), np.moveaxis(parameter, -1, 0), strict=True)\n"
-                    "        clipped = [adaptive_gradient_clip(g.ravel(), p.ravel(), clip, epsilon).reshape(g.shape) for g, p in units]\n"
+                    "        clipped = [adaptive_gradient_clip(g.ravel(), p.ravel(), clip, "
+                    "epsilon).reshape(g.shape) for g, p in units]\n"
                     "        return np.stack(clipped, -1)\n"
                     "    length, size = _norm(gradient), _norm(parameter)"
                 )
@@ -33,7 +34,8 @@ MUTANTS = (
             "optimizer.optimizer_step": {
                 "rate = learning_rate(step, config)": (
                     "rate = learning_rate(step, config)\n"
-                    "    together = max(1.0, _norm(np.concatenate([np.ravel(gradient) for gradient in gradients.values()])))"
+                    "    together = max(1.0, _norm(np.concatenate([np.ravel(gradient) for "
+                    "gradient in gradients.values()])))"
                 ),
                 _CLIP: "np.asarray(gradients[name]) / together",
             }
@@ -92,7 +94,9 @@ MUTANTS = (
         fix="Normalize first, then average: LaProp.",
         edits={
             "optimizer.laprop": {
-                "normalized = np.where(gradient == 0, 0.0, gradient / np.where(gradient == 0, 1.0, root))": "normalized = gradient",
+                (
+                    "normalized = np.where(gradient == 0, 0.0, gradient / np.where(gradient == 0, 1.0, root))"
+                ): "normalized = gradient",
                 "(1 - config.beta1**updates)": "(1 - config.beta1**updates) / np.where(root == 0, 1.0, root)",
             }
         },
@@ -150,7 +154,9 @@ MUTANTS = (
         violates=("OPT-12",),
         fix="Multiply the finished update by the learning rate.",
         edits={
-            "optimizer.laprop": {"(1 - config.beta1) * normalized": "(1 - config.beta1) * learning_rate(step, config) * normalized"},
+            "optimizer.laprop": {
+                "(1 - config.beta1) * normalized": "(1 - config.beta1) * learning_rate(step, config) * normalized"
+            },
             "optimizer.optimizer_step": {"- rate * update": "- update"},
         },
     ),
@@ -176,6 +182,10 @@ MUTANTS = (
         provenance="plausible: mixed-precision scalers skip such steps",
         violates=("OPT-20",),
         fix="Let a NaN show in the parameters, and let the training loop notice.",
-        edits={"optimizer.optimizer_step": {_CLIP: _CLIP.replace("gradients[name]", "np.nan_to_num(gradients[name], posinf=0, neginf=0)")}},
+        edits={
+            "optimizer.optimizer_step": {
+                _CLIP: _CLIP.replace("gradients[name]", "np.nan_to_num(gradients[name], posinf=0, neginf=0)")
+            }
+        },
     ),
 )

@@ -9,7 +9,9 @@ MUTANTS = (
         provenance="plausible; NM512/dreamerv3-torch mixed up environments until commit 43e1b2a",
         violates=("REP-1",),
         fix="Keep a stream for each worker.",
-        edits={"replay.Replay": {"record = self._checked_record(step)": "record, worker = self._checked_record(step), 0"}},
+        edits={
+            "replay.Replay": {"record = self._checked_record(step)": "record, worker = self._checked_record(step), 0"}
+        },
     ),
     Mutant(
         name="capacity_counts_records",
@@ -17,7 +19,11 @@ MUTANTS = (
         provenance="plausible: the paper gives no unit (D-80)",
         violates=("REP-4",),
         fix="Count start positions.",
-        edits={"replay.Replay": {"if len(self._items) < self.capacity:": "if len(self._items) < max(1, self.capacity - self.length):"}},
+        edits={
+            "replay.Replay": {
+                "if len(self._items) < self.capacity:": "if len(self._items) < max(1, self.capacity - self.length):"
+            }
+        },
     ),
     Mutant(
         name="records_are_views",
@@ -25,7 +31,11 @@ MUTANTS = (
         provenance="NM512/dreamerv3-torch, from commit 03d91cb to 78e8670, wrote into stored episodes",
         violates=("REP-6",),
         fix="Copy what is stored.",
-        edits={"replay.Replay": {"np.array(value, self._dtypes[key]) for key": "np.asarray(value, self._dtypes[key]) for key"}},
+        edits={
+            "replay.Replay": {
+                "np.array(value, self._dtypes[key]) for key": "np.asarray(value, self._dtypes[key]) for key"
+            }
+        },
     ),
     Mutant(
         name="no_online_queue",
@@ -81,7 +91,11 @@ MUTANTS = (
         provenance="plausible; the same distribution, but not the same item for the same number",
         violates=("REP-12",),
         fix="Count from the oldest item.",
-        edits={"replay.Replay": {"self._items[(self._oldest + min(int(u * n), n - 1)) % n]": "self._items[min(int(u * n), n - 1)]"}},
+        edits={
+            "replay.Replay": {
+                "self._items[(self._oldest + min(int(u * n), n - 1)) % n]": "self._items[min(int(u * n), n - 1)]"
+            }
+        },
     ),
     Mutant(
         name="latents_of_the_first_trained_step",
@@ -94,11 +108,17 @@ MUTANTS = (
     Mutant(
         name="actions_of_the_same_step",
         explanation="prev_action is the action that was taken at the observation of the same step",
-        provenance="DI-engine; NM512/dreamerv3-torch stores the other convention, and mixing the two is off by one (D-91)",
+        provenance=(
+            "DI-engine; NM512/dreamerv3-torch stores the other convention, and mixing the two is off by one (D-91)"
+        ),
         violates=("REP-15", "CON-12"),
         fix="Give step t the action of record t - 1.",
         edits={
-            "replay.Replay": {'self._gather([row[:-1] for row in rows], "action")': 'self._gather([row[1:] for row in rows], "action")'}
+            "replay.Replay": {
+                (
+                    'self._gather([row[:-1] for row in rows], "action")'
+                ): 'self._gather([row[1:] for row in rows], "action")'
+            }
         },
     ),
     Mutant(
@@ -109,7 +129,9 @@ MUTANTS = (
         fix="Give the first trained step the action of the context step.",
         edits={
             "replay.Replay": {
-                "trained = [row[1:] for row in rows]": 'trained = [row[1:] for row in rows]\n        batch["prev_action"][:, 0] = 0'
+                "trained = [row[1:] for row in rows]": (
+                    'trained = [row[1:] for row in rows]\n        batch["prev_action"][:, 0] = 0'
+                )
             }
         },
     ),
@@ -127,7 +149,11 @@ MUTANTS = (
         provenance="2023 edition, NM512/dreamerv3-torch and sheeprl (D-85)",
         violates=("REP-17",),
         fix="Give the stored flag.",
-        edits={"replay.Replay": {"        return batch\n": '        batch["is_first"][:, 0] = True\n        return batch\n'}},
+        edits={
+            "replay.Replay": {
+                "        return batch\n": '        batch["is_first"][:, 0] = True\n        return batch\n'
+            }
+        },
     ),
     Mutant(
         name="latents_written_one_step_early",

@@ -7,7 +7,10 @@ _IMAGINED = "reward[:, t + 1] + discount * continue_[:, t + 1] * future"
 MUTANTS = (
     Mutant(
         name="return_bootstraps_from_itself",
-        explanation="lambda-return bootstraps from its own value: reward, continue and value are those of the state that is left",
+        explanation=(
+            "lambda-return bootstraps from its own value: reward, continue and value "
+            "are those of the state that is left"
+        ),
         provenance="the paper's printed indices (D-03); NaturalDreamer and naivoder's implementation",
         violates=("RET-1", "CON-13"),
         fix="Use reward, continue and value of the state that is reached, t + 1.",
@@ -21,7 +24,10 @@ MUTANTS = (
     Mutant(
         name="return_aligned_like_v2",
         explanation="lambda-return takes reward and continue of the state that is left, and the value of the next",
-        provenance="DreamerV2's alignment; NM512/dreamerv3-torch until commit 9c58ab6 (issue 16), SimpleDreamer until dbd0810, DI-engine",
+        provenance=(
+            "DreamerV2's alignment; NM512/dreamerv3-torch until commit 9c58ab6 (issue 16), "
+            "SimpleDreamer until dbd0810, DI-engine"
+        ),
         violates=("RET-1", "CON-13"),
         fix="Use reward and continue of the state that is reached, t + 1.",
         edits={"returns.lambda_return": {_IMAGINED: _IMAGINED.replace("t + 1", "t")}},
@@ -86,7 +92,9 @@ MUTANTS = (
         fix="Multiply the weights by the continue of the start state.",
         edits={
             "returns.cumulative_weights": {
-                "product = product * (discount * continue_[:, t])": "product = product * (discount * (continue_[:, t] if t else 1.0))"
+                "product = product * (discount * continue_[:, t])": (
+                    "product = product * (discount * (continue_[:, t] if t else 1.0))"
+                )
             }
         },
     ),
@@ -126,7 +134,11 @@ MUTANTS = (
         provenance="NaturalDreamer samples across episode ends",
         violates=("RET-9", "RET-10"),
         fix="Where the next step is_last, use its annotation alone.",
-        edits={"returns.replay_lambda_return": {"mix = lambda_ * (1 - is_last[:, t + 1])": "mix = lambda_ * (1 - is_terminal[:, t + 1])"}},
+        edits={
+            "returns.replay_lambda_return": {
+                "mix = lambda_ * (1 - is_last[:, t + 1])": "mix = lambda_ * (1 - is_terminal[:, t + 1])"
+            }
+        },
     ),
     Mutant(
         name="replayed_return_of_the_step_before",
@@ -162,7 +174,10 @@ MUTANTS = (
     ),
     Mutant(
         name="return_range_of_extremes",
-        explanation="the return range is that between the smallest and the largest return, so that one outlier shrinks all advantages",
+        explanation=(
+            "the return range is that between the smallest and the largest return, so that "
+            "one outlier shrinks all advantages"
+        ),
         provenance="plausible: minimum and maximum in place of percentiles",
         violates=("RET-14",),
         fix="Take the 5th and the 95th percentile.",

@@ -17,7 +17,9 @@ MUTANTS = (
         provenance="plausible: the paper does not mention the bound (D-26)",
         violates=("RSSM-2",),
         fix="Divide each number by max(1, |a|).",
-        edits={"rssm.core": {"action = action / stop_gradient(np.maximum(1.0, np.abs(action)))": "stop_gradient(action)"}},
+        edits={
+            "rssm.core": {"action = action / stop_gradient(np.maximum(1.0, np.abs(action)))": "stop_gradient(action)"}
+        },
     ),
     Mutant(
         name="norm_within_each_block",
@@ -58,7 +60,9 @@ MUTANTS = (
     ),
     Mutant(
         name="update_gate_without_bias",
-        explanation="the update gate lacks the - 1 before its sigmoid, so that a fresh memory forgets half in each step",
+        explanation=(
+            "the update gate lacks the - 1 before its sigmoid, so that a fresh memory forgets half in each step"
+        ),
         provenance="plausible: an ordinary GRU (D-27)",
         violates=("RSSM-7",),
         fix="Subtract 1 before the sigmoid of the update gate.",
@@ -70,7 +74,9 @@ MUTANTS = (
         provenance="plausible: PyTorch's GRU",
         violates=("RSSM-7",),
         fix="h' = u c + (1 - u) h.",
-        edits={"rssm.core": {"update * candidate + (1.0 - update) * deter": "(1.0 - update) * candidate + update * deter"}},
+        edits={
+            "rssm.core": {"update * candidate + (1.0 - update) * deter": "(1.0 - update) * candidate + update * deter"}
+        },
     ),
     Mutant(
         name="candidate_without_reset",
@@ -99,10 +105,17 @@ MUTANTS = (
     Mutant(
         name="resets_ignored",
         explanation="the memory runs on across the starts of episodes",
-        provenance="NM512/dreamerv3-torch until commit 308eeff (pull request 14); navix and TorchRL until compared with a reference",
+        provenance=(
+            "NM512/dreamerv3-torch until commit 308eeff (pull request 14); navix and "
+            "TorchRL until compared with a reference"
+        ),
         violates=("RSSM-13",),
         fix="Where is_first, replace memory, latents and previous action by zeros before the core.",
-        edits={"rssm.observe_step": {"is_first = np.asarray(is_first, dtype=bool)": "is_first = np.zeros(np.shape(is_first), dtype=bool)"}},
+        edits={
+            "rssm.observe_step": {
+                "is_first = np.asarray(is_first, dtype=bool)": "is_first = np.zeros(np.shape(is_first), dtype=bool)"
+            }
+        },
     ),
     Mutant(
         name="reset_keeps_the_action",
@@ -128,7 +141,9 @@ MUTANTS = (
         fix="A latent before the first step is all zeros.",
         edits={
             "rssm.observe_step": {
-                "np.where(is_first[:, None, None], 0.0, stoch)": "np.where(is_first[:, None, None], np.eye(config.classes)[0], stoch)"
+                "np.where(is_first[:, None, None], 0.0, stoch)": (
+                    "np.where(is_first[:, None, None], np.eye(config.classes)[0], stoch)"
+                )
             }
         },
     ),
@@ -184,7 +199,8 @@ MUTANTS = (
         fix="Let gradients flow through all steps, and cut them only at the stored state.",
         edits={
             "rssm.observe": {
-                'outputs["deter"].append(state["deter"])': 'outputs["deter"].append(state["deter"])\n        before = state\n'
+                'outputs["deter"].append(state["deter"])': 'outputs["deter"].append(state["deter"])\n    '
+                "    before = state\n"
                 "        state = {name: stop_gradient(value) for name, value in state.items()}",
                 'outputs["stoch"].append(state["stoch"])': 'outputs["stoch"].append(before["stoch"])',
             }
@@ -196,7 +212,11 @@ MUTANTS = (
         provenance="sheeprl's notebook until issue 272",
         violates=("RSSM-20",),
         fix="Feed the sampled latents into the next step.",
-        edits={"rssm.imagine": {"core(params, deter, stoch, action, config)": "core(params, deter, stochs[0], action, config)"}},
+        edits={
+            "rssm.imagine": {
+                "core(params, deter, stoch, action, config)": "core(params, deter, stochs[0], action, config)"
+            }
+        },
     ),
     Mutant(
         name="prior_of_the_memory_before",

@@ -6,12 +6,17 @@ MUTANTS = (
     Mutant(
         name="time_limit_is_terminal",
         explanation="a time limit is recorded as a termination",
-        provenance="navix, sheeprl until issue 252, DI-engine, NaturalDreamer; the Atari environment of danijar/dreamerv3 (D-96)",
+        provenance=(
+            "navix, sheeprl until issue 252, DI-engine, NaturalDreamer; the Atari "
+            "environment of danijar/dreamerv3 (D-96)"
+        ),
         violates=("LOOP-10", "CON-11"),
         fix="is_terminal is the environment's `terminated`, without `truncated`.",
         edits={
             "training_loop.step_flags": {
-                "bool(terminated or truncated), bool(terminated)": "bool(terminated or truncated), bool(terminated or truncated)"
+                "bool(terminated or truncated), bool(terminated)": (
+                    "bool(terminated or truncated), bool(terminated or truncated)"
+                )
             }
         },
     ),
@@ -77,7 +82,9 @@ MUTANTS = (
         fix="Scale [-1, 1] to the range 2 wide at the bound.",
         edits={
             "training_loop._rescale": {
-                "np.where(below | above, rescaled, clipped)": "np.clip(np.where(below & above, rescaled, clipped), low, high)"
+                "np.where(below | above, rescaled, clipped)": (
+                    "np.clip(np.where(below & above, rescaled, clipped), low, high)"
+                )
             }
         },
     ),
@@ -119,7 +126,9 @@ MUTANTS = (
         provenance="plausible: sums of floating-point numbers",
         violates=("LOOP-15",),
         fix="Count with the exact value of the ratio.",
-        edits={"training_loop.ReplayRatio": {"Fraction(replay_ratio)": "Fraction(replay_ratio).limit_denominator(1000)"}},
+        edits={
+            "training_loop.ReplayRatio": {"Fraction(replay_ratio)": "Fraction(replay_ratio).limit_denominator(1000)"}
+        },
     ),
     Mutant(
         name="resume_trains_at_once",

@@ -26,7 +26,9 @@ MUTANTS = (
         violates=("TRA-5",),
         fix="Space the bins exponentially: symexp of the numbers from -20 to 20.",
         edits={
-            "transforms.exponential_bins": {"symexp(20.0 * np.arange(1, centre + 1) / centre)": "20.0 * np.arange(1, centre + 1) / centre"}
+            "transforms.exponential_bins": {
+                "symexp(20.0 * np.arange(1, centre + 1) / centre)": "20.0 * np.arange(1, centre + 1) / centre"
+            }
         },
     ),
     Mutant(
@@ -35,7 +37,11 @@ MUTANTS = (
         provenance="2023 edition; TorchRL until issue 4065, NM512/dreamerv3-torch and sheeprl",
         violates=("TRA-7",),
         fix="Interpolate between the raw positions of the bins.",
-        edits={"transforms.twohot": {'bins = checked("bins", bins, "K")': 'x, bins = symlog(x), symlog(checked("bins", bins, "K"))'}},
+        edits={
+            "transforms.twohot": {
+                'bins = checked("bins", bins, "K")': 'x, bins = symlog(x), symlog(checked("bins", bins, "K"))'
+            }
+        },
     ),
     Mutant(
         name="twohot_with_weights_swapped",
@@ -58,7 +64,9 @@ MUTANTS = (
         fix="Share the weight between the two bins around the number.",
         edits={
             "transforms.twohot": {
-                "width = bins[lower + 1] - bins[lower]": "upper = float(number - bins[lower] > bins[lower + 1] - number)",
+                "width = bins[lower + 1] - bins[lower]": (
+                    "upper = float(number - bins[lower] > bins[lower + 1] - number)"
+                ),
                 "(bins[lower + 1] - number) / width": "1.0 - upper",
                 "= (number - bins[lower]) / width": "= upper",
             }
@@ -70,7 +78,11 @@ MUTANTS = (
         provenance="the paper's printed equation, which is not defined there (D-45)",
         violates=("TRA-8",),
         fix="Clamp: beyond an end the end bin has weight 1.",
-        edits={"transforms.twohot": {"weights[(*index, lower)] = 1.0": "weights[(*index, lower)] = float(number == bins[lower])"}},
+        edits={
+            "transforms.twohot": {
+                "weights[(*index, lower)] = 1.0": "weights[(*index, lower)] = float(number == bins[lower])"
+            }
+        },
     ),
     Mutant(
         name="broken_target_trains_a_bin",

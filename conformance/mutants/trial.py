@@ -17,7 +17,8 @@ Reach = Mapping[Check, frozenset[str]]
 
 @contextlib.contextmanager
 def tracing(entered: set[str]) -> Iterator[None]:
-    """While this context lasts, the functions and classes of the reference that are entered are added, as "row.name"."""
+    """While this context lasts, the functions and classes of the reference that are entered are added, as
+    "row.name"."""
 
     def note(frame: FrameType, event: str, argument: Any) -> None:
         module = frame.f_globals.get("__name__", "")
@@ -51,14 +52,16 @@ class TracedReference:
 
 @functools.cache
 def on_the_reference(check: Check, dtype: str, profile: str, seed: int, examples: int) -> tuple[Result, frozenset[str]]:
-    """What a check finds on the reference without a mistake, and which of its functions and classes the check reaches."""
+    """What a check finds on the reference without a mistake, and which of its functions and classes the check
+    reaches."""
     adapter = TracedReference()
     result = run_check(check, adapter, dtype, profile, seed, examples, shrink=False)
     return result, frozenset(adapter.entered)
 
 
 def sound(checks: Iterable[Check], examples: int = 5) -> tuple[dict[Check, frozenset[str]], list[Result]]:
-    """The checks that the reference without a mistake passes, each with what it reaches of the reference; and the results of the others.
+    """The checks that the reference without a mistake passes, each with what it reaches of the reference; and the
+    results of the others.
 
     A check that the reference does not pass would catch anything, so it says nothing about a mutant.
     """
@@ -68,7 +71,8 @@ def sound(checks: Iterable[Check], examples: int = 5) -> tuple[dict[Check, froze
 
 
 def relevant(mutant: Mutant, reach: Reach) -> list[Check]:
-    """The checks that can notice the mutant: first those that call what it changes, then those that reach it through others."""
+    """The checks that can notice the mutant: first those that call what it changes, then those that reach it through
+    others."""
     names = {target.partition(".")[2] for target in mutant.edits}
     return sorted(
         (check for check, entered in reach.items() if entered & mutant.edits.keys()),

@@ -15,7 +15,9 @@ MUTANTS = (
         fix="Either learn the plain flag and discount the returns, or learn the discounted one and leave the returns.",
         edits={
             "world_model.continue_target": {
-                'if config.continue_target == "discounted" else going_on': 'if config.continue_target == "hard" else going_on'
+                (
+                    'if config.continue_target == "discounted" else going_on'
+                ): 'if config.continue_target == "hard" else going_on'
             }
         },
     ),
@@ -26,7 +28,9 @@ MUTANTS = (
         violates=("WM-7", "CON-11"),
         fix="Learn is_terminal: a time limit ends the episode, and not the return.",
         edits={
-            "world_model.world_model_losses": {'continue_target(batch["is_terminal"], config)': 'continue_target(batch["is_last"], config)'}
+            "world_model.world_model_losses": {
+                'continue_target(batch["is_terminal"], config)': 'continue_target(batch["is_last"], config)'
+            }
         },
     ),
     Mutant(
@@ -35,7 +39,11 @@ MUTANTS = (
         provenance="RLlib's Dreamer (issue 31009) and yusukeurakami's (issue 5)",
         violates=("WM-6", "CON-9"),
         fix="Learn the reward that arrived with the observation of the same step.",
-        edits={"world_model.world_model_losses": {'reward_logits, batch["reward"]': 'reward_logits, np.roll(batch["reward"], 1, axis=1)'}},
+        edits={
+            "world_model.world_model_losses": {
+                'reward_logits, batch["reward"]': 'reward_logits, np.roll(batch["reward"], 1, axis=1)'
+            }
+        },
     ),
     Mutant(
         name="reward_squashed",
@@ -43,7 +51,11 @@ MUTANTS = (
         provenance="DreamerV2 on Atari (D-71)",
         violates=("WM-6",),
         fix="Learn the raw reward: the two-hot loss copes with any scale.",
-        edits={"world_model.world_model_losses": {'reward_logits, batch["reward"]': 'reward_logits, np.tanh(batch["reward"])'}},
+        edits={
+            "world_model.world_model_losses": {
+                'reward_logits, batch["reward"]': 'reward_logits, np.tanh(batch["reward"])'
+            }
+        },
     ),
     Mutant(
         name="reward_by_squared_error",
@@ -68,7 +80,9 @@ MUTANTS = (
         fix="Let the reward head read the state with its gradient.",
         edits={
             "world_model.world_model_losses": {
-                "networks.reward_head(params, feature, config)": "networks.reward_head(params, stop_gradient(feature), config)"
+                "networks.reward_head(params, feature, config)": (
+                    "networks.reward_head(params, stop_gradient(feature), config)"
+                )
             }
         },
     ),
@@ -80,7 +94,9 @@ MUTANTS = (
         fix="Let the decoder read the state with its gradient.",
         edits={
             "world_model.world_model_losses": {
-                "networks.decoder(params, feature, spaces, config)": "networks.decoder(params, stop_gradient(feature), spaces, config)"
+                "networks.decoder(params, feature, spaces, config)": (
+                    "networks.decoder(params, stop_gradient(feature), spaces, config)"
+                )
             }
         },
     ),
@@ -90,7 +106,11 @@ MUTANTS = (
         provenance="plausible: a library's default reduction",
         violates=("WM-2",),
         fix="Sum over the entries.",
-        edits={"world_model.reconstruction_losses": {"config.vector_loss_scale).sum(axis=-1)": "config.vector_loss_scale).mean(axis=-1)"}},
+        edits={
+            "world_model.reconstruction_losses": {
+                "config.vector_loss_scale).sum(axis=-1)": "config.vector_loss_scale).mean(axis=-1)"
+            }
+        },
     ),
     Mutant(
         name="image_loss_averaged",
@@ -160,7 +180,9 @@ MUTANTS = (
         edits={
             "world_model.kl_losses": {
                 _DYNAMICS: "np.maximum(config.free_nats, categorical_kl(stop_gradient(posterior), prior)).sum(axis=-1)",
-                _REPRESENTATION: "np.maximum(config.free_nats, categorical_kl(posterior, stop_gradient(prior))).sum(axis=-1)",
+                _REPRESENTATION: (
+                    "np.maximum(config.free_nats, categorical_kl(posterior, stop_gradient(prior))).sum(axis=-1)"
+                ),
                 _CLIPPED: "return dynamics, representation",
             }
         },
@@ -174,7 +196,8 @@ MUTANTS = (
         edits={
             "world_model.kl_losses": {
                 _CLIPPED: (
-                    "means = [np.full(kl.shape, np.maximum(config.free_nats, kl.mean())) for kl in (dynamics, representation)]\n"
+                    "means = [np.full(kl.shape, np.maximum(config.free_nats, kl.mean())) for "
+                    "kl in (dynamics, representation)]\n"
                     "    return means[0], means[1]"
                 )
             }
@@ -220,7 +243,11 @@ MUTANTS = (
         provenance="plausible",
         violates=("WM-13",),
         fix="Let the prior read the memory with its gradient.",
-        edits={"world_model.world_model_losses": {"rssm.prior(params, deter, config)": "rssm.prior(params, stop_gradient(deter), config)"}},
+        edits={
+            "world_model.world_model_losses": {
+                "rssm.prior(params, deter, config)": "rssm.prior(params, stop_gradient(deter), config)"
+            }
+        },
     ),
     Mutant(
         name="open_loop_sees_everything",
@@ -263,7 +290,8 @@ MUTANTS = (
         edits={
             "world_model.open_loop": {
                 'prev_action = checked("prev_action", prev_action, rows, steps, spaces.action_size)': (
-                    'prev_action = np.roll(checked("prev_action", prev_action, rows, steps, spaces.action_size), -1, axis=1)'
+                    'prev_action = np.roll(checked("prev_action", prev_action, rows, steps, '
+                    "spaces.action_size), -1, axis=1)"
                 )
             }
         },
@@ -274,7 +302,9 @@ MUTANTS = (
         provenance="plausible",
         violates=("WM-20",),
         fix="Where is_first, predict from zeros.",
-        edits={"world_model.open_loop": {"starts = is_first[:, t, None]": "starts = np.zeros_like(is_first[:, t, None])"}},
+        edits={
+            "world_model.open_loop": {"starts = is_first[:, t, None]": "starts = np.zeros_like(is_first[:, t, None])"}
+        },
     ),
     Mutant(
         name="open_loop_in_symlog_space",

@@ -15,7 +15,10 @@ def render(data: Data) -> str:
     widths = [round(len(part) * CHARACTER + 2 * PADDING) for part in (LABEL, right)]
     total = sum(widths)
     parts = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" width="{total}" height="{HEIGHT}" role="img" aria-label="{escape(f"{LABEL}: {right}")}">',
+        (
+            f'<svg xmlns="http://www.w3.org/2000/svg" width="{total}" height="{HEIGHT}" role="img" '
+            f'aria-label="{escape(f"{LABEL}: {right}")}">'
+        ),
         f"<title>{escape(f'{LABEL}: {right}')}</title>",
         f'<clipPath id="r"><rect width="{total}" height="{HEIGHT}" rx="4"/></clipPath>',
         f'<g clip-path="url(#r)"><rect width="{widths[0]}" height="{HEIGHT}" fill="#343b45"/>'
@@ -45,4 +48,7 @@ def outcome(data: Data) -> tuple[str, str]:
 
 
 def _text(words: str, x: float, width: float) -> str:
-    return f'<text x="{x}" y="14" textLength="{width - 2 * PADDING}" lengthAdjust="spacingAndGlyphs">{escape(words)}</text>'
+    return (
+        f'<text x="{x}" y="14" textLength="{width - 2 * PADDING}" '
+        f'lengthAdjust="spacingAndGlyphs">{escape(words)}</text>'
+    )

@@ -1,4 +1,5 @@
-"""The result of one run or of several as one HTML page that needs nothing else. Whatever comes from a result is escaped."""
+"""The result of one run or of several as one HTML page that needs nothing else. Whatever comes from a result is
+escaped."""
 
 import re
 from collections.abc import Sequence
@@ -10,19 +11,28 @@ from conformance.reports.summary import Data
 
 POLICY = "default-src 'none'; style-src 'unsafe-inline'"
 KIND = {
-    **{"pass": "pass", "fail": "fail", "error": "fail", summary.EXTREME: "known", "expected failure": "known", "partly offered": "pass"},
+    **{
+        "pass": "pass",
+        "fail": "fail",
+        "error": "fail",
+        summary.EXTREME: "known",
+        "expected failure": "known",
+        "partly offered": "pass",
+    },
     **{"not offered": "none", "not in edition": "none"},
 }
 SHORT = {summary.EXTREME: "at extremes", "expected failure": "as expected", "partly offered": "partly"}
 CELL_ORDER = ("fail", summary.EXTREME, "expected failure", "pass", "partly offered", "not offered", "not in edition")
 EXTREMES = (
-    '<p class="small muted">NaN, infinities, huge or tiny numbers, or what must be refused. With ordinary input these checks pass.</p>'
+    '<p class="small muted">NaN, infinities, huge or tiny numbers, or what must be refused. With '
+    "ordinary input these checks pass.</p>"
 )
 OPEN = 3  # so many failures of a result are open from the start
 
 
 def render(results: Sequence[Data], origins: Sequence[str] = ()) -> str:
-    """The page: verdicts, the matrix of requirements and implementations, the mistakes recognized, and every failure in full.
+    """The page: verdicts, the matrix of requirements and implementations, the mistakes recognized, and every failure in
+    full.
 
     origins: where each result is from, for names; its candidate, unless given.
     """
@@ -38,11 +48,17 @@ def render(results: Sequence[Data], origins: Sequence[str] = ()) -> str:
     ]
     body = [
         f"<h1>{title}</h1>",
-        '<p class="muted">What an implementation computes, held against the specification requirement by requirement.</p>',
+        (
+            '<p class="muted">What an implementation computes, held against the '
+            "specification requirement by requirement.</p>"
+        ),
         f'<div class="cards">{"".join(map(_card, results, names))}</div>',
         *(_diagnoses(data, name) for data, name in named),
         "<h2>Chapters</h2>",
-        '<p class="small muted">Requirements, by what was found. The bar is the worst deviation as a share of the allowed one.</p>',
+        (
+            '<p class="small muted">Requirements, by what was found. The bar is the worst '
+            "deviation as a share of the allowed one.</p>"
+        ),
         _overview(results, names),
         *(_failures(data, position, name) for position, (data, name) in enumerate(named)),
         *(_expected(data, position, name) for position, (data, name) in enumerate(named)),
@@ -50,7 +66,19 @@ def render(results: Sequence[Data], origins: Sequence[str] = ()) -> str:
         f'<p class="small muted">{summary.SCALE} Such a failure stands without a number. An empty cell: not run.</p>',
         _matrix(results, names),
     ]
-    return "\n".join(["<!doctype html>", '<html lang="en-GB"><head>', *head, "</head><body>", *filter(None, body), "</body></html>"]) + "\n"
+    return (
+        "\n".join(
+            [
+                "<!doctype html>",
+                '<html lang="en-GB"><head>',
+                *head,
+                "</head><body>",
+                *filter(None, body),
+                "</body></html>",
+            ]
+        )
+        + "\n"
+    )
 
 
 def chapter_link(path: str) -> str:
@@ -73,7 +101,9 @@ def _emphasized(text: str) -> str:
 
 def _card(data: Data, name: str) -> str:
     passed, counts = data["verdict"]["passed"], summary.counts(data)
-    others = [f"{counts[name]} {name}" for name in ("expected failure", "not offered", "not in edition") if counts[name]]
+    others = [
+        f"{counts[name]} {name}" for name in ("expected failure", "not offered", "not in edition") if counts[name]
+    ]
     problems = "".join(f"<li>{escape(problem)}</li>" for problem in summary.problems(data))
     versions = ", ".join(f"{name} {version}" for name, version in data["versions"].items())
     lines = [
@@ -126,7 +156,10 @@ def _matrix(results: Sequence[Data], names: Sequence[str]) -> str:
         heading = f"{escape(summary.title(path))}, {len(all_here)} requirements"
         tables = [_requirements(results, names, offered)] if offered else []
         if absent:
-            tables.append(f"<details><summary>{len(absent)} not offered</summary>{_requirements(results, names, absent)}</details>")
+            tables.append(
+                f"<details><summary>{len(absent)} not "
+                f"offered</summary>{_requirements(results, names, absent)}</details>"
+            )
         parts.append(
             f'<details class="box" id="{_chapter_identifier(path)}"{opened}><summary>{heading}</summary>'
             f"<p>{chapter_link(path)}</p>{''.join(tables)}</details>"
@@ -154,7 +187,12 @@ def _status(data: Data, requirement: str) -> str:
 
 
 def _requirements(results: Sequence[Data], names: Sequence[str], requirements: Sequence[str]) -> str:
-    texts = {name: data["requirements"][name]["text"] for data in results for name in requirements if name in data["requirements"]}
+    texts = {
+        name: data["requirements"][name]["text"]
+        for data in results
+        for name in requirements
+        if name in data["requirements"]
+    }
     rows = (
         f"<tr><th>{escape(name)}</th>"
         f"{''.join(_requirement_cell(data, position, name) for position, data in enumerate(results))}"
@@ -182,7 +220,9 @@ def _requirement_cell(data: Data, position: int, name: str) -> str:
 
 
 def _cell(kind: str, markup: str, share: float | None = None) -> str:
-    bar = "" if share is None else f'<span class="bar"><span style="width: {min(100.0, 100 * share):.0f}%"></span></span>'
+    bar = (
+        "" if share is None else f'<span class="bar"><span style="width: {min(100.0, 100 * share):.0f}%"></span></span>'
+    )
     return f'<td class="cell {kind}">{markup}{bar}</td>'
 
 
@@ -205,9 +245,14 @@ def _diagnosis(found: Data) -> str:
     lines = [
         f"<p>Behaves like <b>{escape(found['mutant'])}</b>: {escape(found['explanation'])}</p>",
         f'<p class="small muted">Known from: {escape(found["provenance"])}</p>' if found["provenance"] else "",
-        f"<p>{escape(found['fix'])} See {chapter_link(found['chapter'])}, {escape(', '.join(found['requirements']))}.</p>",
+        (
+            f"<p>{escape(found['fix'])} See {chapter_link(found['chapter'])}, "
+            f"{escape(', '.join(found['requirements']))}.</p>"
+        ),
         f'<p class="small muted">Explains {escape(", ".join(found["explained"]))}</p>',
-        f'<p class="small muted">Cannot be told from {escape(", ".join(found["alternatives"]))}</p>' if found["alternatives"] else "",
+        f'<p class="small muted">Cannot be told from {escape(", ".join(found["alternatives"]))}</p>'
+        if found["alternatives"]
+        else "",
     ]
     return f'<div class="diagnosis">{"".join(lines)}</div>'
 
@@ -228,12 +273,18 @@ def _failures(data: Data, position: int, name: str) -> str:
     """The ordinary ones, of which the first are open, and then those with extreme input only."""
     found = summary.failures(data)
     ordinary = _heading("Failures", name) + _boxes(data, position, found.ordinary, OPEN) if found.ordinary else ""
-    extreme = _heading("Only with extreme input", name) + EXTREMES + _boxes(data, position, found.extreme, 0) if found.extreme else ""
+    extreme = (
+        _heading("Only with extreme input", name) + EXTREMES + _boxes(data, position, found.extreme, 0)
+        if found.extreme
+        else ""
+    )
     return ordinary + extreme
 
 
 def _boxes(data: Data, position: int, failing: Sequence[tuple[str, Data]], opened: int) -> str:
-    return "".join(_failure(data, position, name, check, number < opened) for number, (name, check) in enumerate(failing))
+    return "".join(
+        _failure(data, position, name, check, number < opened) for number, (name, check) in enumerate(failing)
+    )
 
 
 def _failure(data: Data, position: int, name: str, check: Data, is_open: bool) -> str:
@@ -247,14 +298,18 @@ def _failure(data: Data, position: int, name: str, check: Data, is_open: bool) -
         f'<p class="small muted">{escape(", ".join(check["requirements"]))}: {links}</p>',
         f'<p class="known">Expected to fail: {escape(check["expected_failure"])}</p>' if is_expected else "",
         f"<pre>{escape(cause)}</pre>",
-        f"<p>Behaves like <b>{escape(', '.join(found['mutant'] for found in diagnoses))}</b>, see above.</p>" if diagnoses else "",
+        f"<p>Behaves like <b>{escape(', '.join(found['mutant'] for found in diagnoses))}</b>, see above.</p>"
+        if diagnoses
+        else "",
         f"<h3>The call of {escape(failure['function'])}</h3>{_values(failure)}" if failure["function"] else "",
         f"<h3>See it again</h3><pre>{escape(failure['command'])}</pre><pre>{escape(failure['snippet'])}</pre>",
         f"<details><summary>Traceback</summary><pre>{escape(message)}</pre></details>" if cause != message else "",
     ]
     kind, opened = KIND[summary.told(check)].replace("fail", "bad"), (" open" if is_open else "")
     summary_line = f"{escape(name)} <span class=muted>{escape(check['status'])}</span>"
-    heading = f'<details class="box {kind}" id="{_identifier(position, name)}"{opened}><summary>{summary_line}</summary>'
+    heading = (
+        f'<details class="box {kind}" id="{_identifier(position, name)}"{opened}><summary>{summary_line}</summary>'
+    )
     return f"{heading}{''.join(parts)}</details>"
 
 

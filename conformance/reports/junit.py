@@ -1,4 +1,5 @@
-"""The result as JUnit XML, which CI services show: a test suite for each row of the grid, a test case for each check."""
+"""The result as JUnit XML, which CI services show: a test suite for each row of the grid, a test case for each
+check."""
 
 import re
 from xml.etree import ElementTree
@@ -10,7 +11,8 @@ _FORBIDDEN = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]"
 
 
 def render(data: Data) -> str:
-    """Expected failures are skipped, and what is not judged. What else stands against the run is a failure in the suite `verdict`."""
+    """Expected failures are skipped, and what is not judged. What else stands against the run is a failure in the suite
+    `verdict`."""
     suites = ElementTree.Element("testsuites", name=_text(f"conformance of {summary.label(data)}"))
     by_row: dict[str, list[ElementTree.Element]] = {}
     for name, check in data["checks"].items():
@@ -18,8 +20,15 @@ def render(data: Data) -> str:
         by_row.setdefault(row, []).append(_case(data, row, title, check))
     by_row["verdict"] = [_verdict(data)]
     for row, cases in by_row.items():
-        kinds = {kind: str(sum(case.find(kind) is not None for case in cases)) for kind in ("failure", "error", "skipped")}
-        counts = {"tests": str(len(cases)), "failures": kinds["failure"], "errors": kinds["error"], "skipped": kinds["skipped"]}
+        kinds = {
+            kind: str(sum(case.find(kind) is not None for case in cases)) for kind in ("failure", "error", "skipped")
+        }
+        counts = {
+            "tests": str(len(cases)),
+            "failures": kinds["failure"],
+            "errors": kinds["error"],
+            "skipped": kinds["skipped"],
+        }
         suite = ElementTree.SubElement(suites, "testsuite", {"name": _text(row), **counts})
         _properties(suite, data)
         suite.extend(cases)
@@ -58,8 +67,22 @@ def _case(data: Data, row: str, title: str, check: Data) -> ElementTree.Element:
 def _details(data: Data, name: str, check: Data) -> str:
     failure = check["failure"]
     values = [f"{value['name']}: {value['type']}\n{value['text']}" for value in summary.values(failure)]
-    diagnoses = [f"behaves like {found['mutant']}: {found['explanation']} {found['fix']}" for found in summary.matching(data, name)]
-    return "\n\n".join(["", check["summary"], check["message"].strip(), *diagnoses, *values, failure["command"], failure["snippet"], ""])
+    diagnoses = [
+        f"behaves like {found['mutant']}: {found['explanation']} {found['fix']}"
+        for found in summary.matching(data, name)
+    ]
+    return "\n\n".join(
+        [
+            "",
+            check["summary"],
+            check["message"].strip(),
+            *diagnoses,
+            *values,
+            failure["command"],
+            failure["snippet"],
+            "",
+        ]
+    )
 
 
 def _verdict(data: Data) -> ElementTree.Element:

@@ -65,7 +65,8 @@ def _chapters(data: Data) -> str:
 
 def _diagnoses(data: Data) -> list[str]:
     lines = [
-        f"- **{text(found['mutant'])}**: {text(found['explanation'])} See {chapter(found['chapter'])}. {text(found['fix'])} "
+        f"- **{text(found['mutant'])}**: {text(found['explanation'])} See "
+        f"{chapter(found['chapter'])}. {text(found['fix'])} "
         f"Explains {', '.join(map(code, found['explained']))}."
         + (f" Known from: {text(found['provenance'])}." if found["provenance"] else "")
         for found in data["diagnoses"]
@@ -93,7 +94,10 @@ def _failure(name: str, check: Data) -> list[str]:
         f"{', '.join(check['requirements'])}: {text(check['summary'])}{expected}",
         block(check["message"], "text"),
     ]
-    rows = [[code(value["name"]), text(value["type"]), code(value["text"]).replace("|", "\\|")] for value in summary.values(failure)]
+    rows = [
+        [code(value["name"]), text(value["type"]), code(value["text"]).replace("|", "\\|")]
+        for value in summary.values(failure)
+    ]
     if rows:
         parts += [f"The call of {code(failure['function'])}:", table(["", "type", "value"], rows)]
     return [*parts, block(failure["command"], "sh"), block(failure["snippet"], "python")]

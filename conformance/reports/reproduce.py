@@ -19,35 +19,71 @@ def failure(result: Result, settings: Settings) -> dict[str, Any]:
     if call is not None:
         names = INTERFACE[call.function]
         entries = [shown(name, value) for name, value in zip(names, call.arguments, strict=False)]
-        found = {"function": call.function, "arguments": [entry for group in entries for entry in group], "got": None, "expected": None}
+        found = {
+            "function": call.function,
+            "arguments": [entry for group in entries for entry in group],
+            "got": None,
+            "expected": None,
+        }
         if call.got is not None and call.expected is not None:
-            found["got"], found["expected"] = shown("got", call.got, call.index)[0], shown("expected", call.expected, call.index)[0]
-    return {**found, "command": command(result.check.name, settings), "snippet": snippet(result.check.name, call, settings)}
+            found["got"], found["expected"] = (
+                shown("got", call.got, call.index)[0],
+                shown("expected", call.expected, call.index)[0],
+            )
+    return {
+        **found,
+        "command": command(result.check.name, settings),
+        "snippet": snippet(result.check.name, call, settings),
+    }
 
 
 def command(name: str, settings: Settings) -> str:
     """The command line that runs this check alone, on the same cases."""
     words = ["conformance", "check", *(["--process"] if settings.process else []), settings.candidate]
-    words += ["--dtype", settings.dtype, *(["--device", settings.device] if settings.device else []), "--edition", settings.edition]
+    words += [
+        "--dtype",
+        settings.dtype,
+        *(["--device", settings.device] if settings.device else []),
+        "--edition",
+        settings.edition,
+    ]
     return shlex.join([*words, "--only", name, "--seed", str(settings.seed), "--examples", str(settings.examples)])
 
 
 def snippet(name: str, call: Call | None, settings: Settings) -> str:
     """Python that makes the failing call again.
 
-    Arguments of up to WRITTEN_OUT numbers are written out. Larger ones are made anew by running the check; so is a call that makes an
-    object, which fails in one of its methods.
+    Arguments of up to WRITTEN_OUT numbers are written out. Larger ones are made anew by running the check; so is a call
+    that makes an object, which fails in one of its methods.
     """
     adapter = _adapter(settings)
-    is_written = call is not None and call.function not in OBJECTS and size(call.arguments) <= WRITTEN_OUT and is_known(call.arguments)
+    is_written = (
+        call is not None
+        and call.function not in OBJECTS
+        and size(call.arguments) <= WRITTEN_OUT
+        and is_known(call.arguments)
+    )
     if call is not None and is_written:
         names = INTERFACE[call.function]
         arguments = [(name, source(value)) for name, value in zip(names, call.arguments, strict=True)]
-        spec = [word for word in ("Discrete", "Image", "Parameter", "Spaces", "Vector", "load_config") if f"{word}(" in str(arguments)]
-        lines = ["import numpy as np", "", adapter[0], *([f"from spec import {', '.join(spec)}"] if spec else []), "", adapter[1]]
+        spec = [
+            word
+            for word in ("Discrete", "Image", "Parameter", "Spaces", "Vector", "load_config")
+            if f"{word}(" in str(arguments)
+        ]
+        lines = [
+            "import numpy as np",
+            "",
+            adapter[0],
+            *([f"from spec import {', '.join(spec)}"] if spec else []),
+            "",
+            adapter[1],
+        ]
         lines += [f"{name} = {text}" for name, text in arguments]
         return "\n".join([*lines, f"print(adapter.{call.function}({', '.join(names)}))"])
-    options = f"find_edition({settings.edition!r}), {settings.dtype!r}, seed={settings.seed}, examples={settings.examples}"
+    options = (
+        f"find_edition({settings.edition!r}), {settings.dtype!r}, seed={settings.seed}, examples={settings.examples}"
+    )
     lines = [
         "import conformance.cases",
         adapter[0],

@@ -17,17 +17,20 @@ Data = Mapping[str, Any]
 FAILING = ("fail", "error")
 EXTREME = "fail at extremes"
 STATUSES = ("pass", "fail", "error", EXTREME, "expected failure", "partly offered", "not offered", "not in edition")
-"""As told: a failure may be only with extreme input, or expected; of a requirement, some checks may be offered and others not."""
+"""As told: a failure may be only with extreme input, or expected; of a requirement, some checks may be offered and
+others not."""
 UNMEASURED = "not measurable"
 SCALE = (
     "The worst deviation, as a share of the allowed one: 100% is the limit, and 20× is twenty times as much. "
-    f"{UNMEASURED.capitalize()}: an exception, NaN, a wrong shape, a condition that does not hold, or unequal numbers that must be equal."
+    f"{UNMEASURED.capitalize()}: an exception, NaN, a wrong shape, a condition that does not hold, or "
+    f"unequal numbers that must be equal."
 )
 
 
 @dataclasses.dataclass(frozen=True)
 class Failures:
-    """The checks that failed, by name. extreme: only with extreme input. Those that a recognized mistake explains come first in each."""
+    """The checks that failed, by name. extreme: only with extreme input. Those that a recognized mistake explains come
+    first in each."""
 
     ordinary: list[tuple[str, Data]]
     extreme: list[tuple[str, Data]]
@@ -46,7 +49,8 @@ class Failures:
 
 @dataclasses.dataclass(frozen=True)
 class Chapter:
-    """What was found for the requirements of one chapter. counts: of STATUSES. share: the worst, None where it has no size."""
+    """What was found for the requirements of one chapter. counts: of STATUSES. share: the worst, None where it has no
+    size."""
 
     path: str
     requirements: tuple[str, ...]
@@ -67,7 +71,9 @@ def title(path: str) -> str:
 @functools.cache
 def _titles() -> dict[str, str]:
     files = [file for file in resources.files("spec").iterdir() if file.name.endswith(".md")]
-    headings = {f"spec/{file.name}": file.read_text(encoding="utf-8").partition("\n")[0].partition(":")[0] for file in files}
+    headings = {
+        f"spec/{file.name}": file.read_text(encoding="utf-8").partition("\n")[0].partition(":")[0] for file in files
+    }
     return {path: heading.lstrip("# ").replace(" · ", " ") for path, heading in headings.items()}
 
 
@@ -154,7 +160,8 @@ def label(data: Data) -> str:
 
 
 def names(results: Sequence[Data], origins: Sequence[str]) -> list[str]:
-    """A name for each of several results: its label, and among equal ones precision and edition, and then the origin."""
+    """A name for each of several results: its label, and among equal ones precision and edition, and then the
+    origin."""
     found = [label(data) for data in results]
     for parts in ([f" {data['dtype']}, {data['edition']}" for data in results], [f", {origin}" for origin in origins]):
         shared = Counter(found)
@@ -205,10 +212,13 @@ def problems(data: Data) -> list[str]:
 
 
 def unchecked(data: Data) -> list[str]:
-    """Lines, if any: the functions that are offered and that no check could use, and what is said to be not implemented."""
+    """Lines, if any: the functions that are offered and that no check could use, and what is said to be not
+    implemented."""
     lacking = [f"{entry['function']} (needs {', '.join(entry['needs'])})" for entry in data["unchecked"]]
     messages = (check["message"] for check in data["checks"].values() if check["status"] == "not offered")
-    absent = dict.fromkeys(message.removeprefix(NOT_IMPLEMENTED).rstrip() for message in messages if message.startswith(NOT_IMPLEMENTED))
+    absent = dict.fromkeys(
+        message.removeprefix(NOT_IMPLEMENTED).rstrip() for message in messages if message.startswith(NOT_IMPLEMENTED)
+    )
     parts = {"Offered but not checked": lacking, "Not implemented, as the candidate says": absent}
     return [f"{words}: {', '.join(entries)}." for words, entries in parts.items() if entries]
 
@@ -248,7 +258,9 @@ def repository() -> str:
     except importlib.metadata.PackageNotFoundError:
         return ""
     named = dict(address.split(", ", 1) for address in addresses)
-    return next((url.rstrip("/") for name, url in named.items() if name.lower() in ("repository", "source", "homepage")), "")
+    return next(
+        (url.rstrip("/") for name, url in named.items() if name.lower() in ("repository", "source", "homepage")), ""
+    )
 
 
 def address(path: str) -> str:

@@ -12,7 +12,13 @@ from conformance.reports import summary
 from conformance.reports.summary import Data
 from conformance.reports.values import brief
 
-STYLE = {"pass": "green", "fail": "bold red", "error": "bold red", summary.EXTREME: "yellow", "expected failure": "yellow"}
+STYLE = {
+    "pass": "green",
+    "fail": "bold red",
+    "error": "bold red",
+    summary.EXTREME: "yellow",
+    "expected failure": "yellow",
+}
 SHOWN = 5  # failures in full; the others by name
 LINES = 10  # of one message: the last of a traceback say what happened
 
@@ -31,12 +37,17 @@ def show(console: Console, data: Data) -> None:
         console.print("\n[bold]Only with extreme input[/]", highlight=False)
         _failures(console, failures.extreme, max(0, SHOWN - len(failures.ordinary)))
     for entry in data["expected_failures"]:
-        outcome = {"fail": "fails as expected", "pass": "passes, and is expected to fail", "not run": "was not run"}[entry["outcome"]]
+        outcome = {"fail": "fails as expected", "pass": "passes, and is expected to fail", "not run": "was not run"}[
+            entry["outcome"]
+        ]
         _plain(console, f"{entry['name']} {outcome}: {entry['reason']}")
     _plain(console, summary.tally(data))
     if not summary.judged(data):
         _plain(console, "nothing was checked: the functions that these checks need are not offered")
-    console.print(f"[{'bold green' if data['verdict']['passed'] else 'bold red'}]{escape(summary.headline(data))}[/]", highlight=False)
+    console.print(
+        f"[{'bold green' if data['verdict']['passed'] else 'bold red'}]{escape(summary.headline(data))}[/]",
+        highlight=False,
+    )
     if len(failures.ordinary) + len(failures.extreme) > SHOWN:
         _plain(console, "everything in full: --html FILE")
 
@@ -47,12 +58,18 @@ def _plain(console: Console, text: str) -> None:
 
 def _chapters(console: Console, data: Data) -> None:
     title = f"{summary.label(data)}: {summary.settings(data)}"
-    table = Table(title=escape(title), title_justify="left", title_style="", caption=summary.SCALE, caption_justify="left")
+    table = Table(
+        title=escape(title), title_justify="left", title_style="", caption=summary.SCALE, caption_justify="left"
+    )
     for column in ("chapter", "requirements", "worst, of allowed", "where"):
         table.add_column(column, overflow="fold")
     for chapter in summary.chapters(data):
         if chapter.counts["not offered"] != len(chapter.requirements):
-            found = [f"[{STYLE.get(name, 'default')}]{chapter.counts[name]} {name}[/]" for name in summary.STATUSES if chapter.counts[name]]
+            found = [
+                f"[{STYLE.get(name, 'default')}]{chapter.counts[name]} {name}[/]"
+                for name in summary.STATUSES
+                if chapter.counts[name]
+            ]
             table.add_row(chapter.title, ", ".join(found), summary.percent(chapter.share), escape(chapter.where))
     if table.row_count:
         console.print(table)
@@ -61,7 +78,9 @@ def _chapters(console: Console, data: Data) -> None:
 
 
 def _diagnosis(console: Console, diagnosis: Data) -> None:
-    console.print(f"\n[bold]behaves like {escape(diagnosis['mutant'])}[/]: {escape(diagnosis['explanation'])}", highlight=False)
+    console.print(
+        f"\n[bold]behaves like {escape(diagnosis['mutant'])}[/]: {escape(diagnosis['explanation'])}", highlight=False
+    )
     if diagnosis["provenance"]:
         _plain(console, f"  known from: {diagnosis['provenance']}")
     _plain(console, f"  see {diagnosis['chapter']}. {diagnosis['fix']}")
@@ -73,12 +92,19 @@ def _diagnosis(console: Console, diagnosis: Data) -> None:
 def _failures(console: Console, failing: Sequence[tuple[str, Data]], shown: int) -> None:
     """Some in full, the others by name."""
     for name, check in failing[:shown]:
-        console.print(f"\n[bold red]{name}[/] ({', '.join(check['requirements'])}): {escape(check['summary'])}", highlight=False)
+        console.print(
+            f"\n[bold red]{name}[/] ({', '.join(check['requirements'])}): {escape(check['summary'])}", highlight=False
+        )
         lines = check["message"].rstrip().splitlines()
         _plain(console, "\n".join(["..."] * (len(lines) > LINES) + lines[-LINES:]))
         failure = check["failure"]
         if failure["function"]:
-            _plain(console, "\n".join([f"  {failure['function']}, called with", *(f"    {line}" for line in brief(failure["arguments"]))]))
+            _plain(
+                console,
+                "\n".join(
+                    [f"  {failure['function']}, called with", *(f"    {line}" for line in brief(failure["arguments"]))]
+                ),
+            )
         console.print(f"  {failure['command']}", markup=False, highlight=False, soft_wrap=True)
     if len(failing) > shown:
         number = f"and {len(failing) - shown} more" if shown else f"{len(failing)}"
@@ -90,4 +116,8 @@ def _printable(value: Any) -> Any:
         return {_printable(key): _printable(entry) for key, entry in value.items()}
     if isinstance(value, list):
         return list(map(_printable, value))
-    return re.sub(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]", "\N{REPLACEMENT CHARACTER}", value) if isinstance(value, str) else value
+    return (
+        re.sub(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]", "\N{REPLACEMENT CHARACTER}", value)
+        if isinstance(value, str)
+        else value
+    )

@@ -15,7 +15,18 @@ SYMBOLS = {
         "upsilon": "υ",
         "ell": "ℓ",
     },
-    **{"infty": "∞", "cdot": "·", "times": "×", "le": "≤", "ge": "≥", "lt": "<", "gt": ">", "approx": "≈", "in": "∈", "to": "→"},
+    **{
+        "infty": "∞",
+        "cdot": "·",
+        "times": "×",
+        "le": "≤",
+        "ge": "≥",
+        "lt": "<",
+        "gt": ">",
+        "approx": "≈",
+        "in": "∈",
+        "to": "→",
+    },
     **{"sum": "Σ", "ldots": "…", "dots": "…", "bmod": "mod"},
 }
 """Commands by what stands for them. Any other is its own name: max, ln, tanh."""

@@ -19,7 +19,8 @@ WIDTH = 100
 
 
 def shown(name: str, value: Any, index: tuple[int, ...] | None = None) -> list[dict[str, Any]]:
-    """Entries with name, type, text, and whether the text is the whole value; a nested value gives one for each of its arrays.
+    """Entries with name, type, text, and whether the text is the whole value; a nested value gives one for each of its
+    arrays.
 
     index: of the element that matters, in an array.
     """
@@ -60,7 +61,10 @@ def _around(array: np.ndarray, index: tuple[int, ...]) -> str:
     *rows, column = index
     start, stop = max(0, column - NEIGHBOURS), min(array.shape[-1], column + NEIGHBOURS + 1)
     place = ", ".join([*map(str, rows), f"{start}:{stop}"])
-    return f"the worst element, at {_shape(index)}: {number(array[index])}\n[{place}] = {array_text(array[tuple(rows)][start:stop])}"
+    return (
+        f"the worst element, at {_shape(index)}: {number(array[index])}\n[{place}] = "
+        f"{array_text(array[tuple(rows)][start:stop])}"
+    )
 
 
 def _extent(array: np.ndarray) -> str:
@@ -74,7 +78,8 @@ def _extent(array: np.ndarray) -> str:
 
 
 def brief(entries: Sequence[Mapping[str, Any]]) -> list[str]:
-    """A line for each value of `shown`: the value itself where it fits into two lines, else its type. After BRIEF lines, dots."""
+    """A line for each value of `shown`: the value itself where it fits into two lines, else its type. After BRIEF
+    lines, dots."""
     lines = []
     for entry in entries[:BRIEF]:
         text = " ".join(entry["text"].split())
@@ -93,7 +98,9 @@ def number(value: Any) -> str:
 
 def array_text(array: np.ndarray) -> str:
     """Every number of an array, in brackets."""
-    return np.array2string(array, max_line_width=WIDTH, separator=", ", threshold=array.size + 1, formatter={"all": number})
+    return np.array2string(
+        array, max_line_width=WIDTH, separator=", ", threshold=array.size + 1, formatter={"all": number}
+    )
 
 
 def is_known(value: Any) -> bool:
@@ -123,7 +130,11 @@ def source(value: Any) -> str:
         is_default = value.dtype in (np.float64, np.int64, np.bool_)
         return f"np.array({array_text(value)}{'' if is_default else f', np.dtype({value.dtype.name!r})'})"
     if isinstance(value, np.generic):
-        return number(value) if value.dtype in (np.float64, np.int64, np.bool_) else f"np.dtype({value.dtype.name!r}).type({number(value)})"
+        return (
+            number(value)
+            if value.dtype in (np.float64, np.int64, np.bool_)
+            else f"np.dtype({value.dtype.name!r}).type({number(value)})"
+        )
     if isinstance(value, Mapping):
         return "{" + ", ".join(f"{key!r}: {source(entry)}" for key, entry in value.items()) + "}"
     if isinstance(value, tuple):
@@ -142,6 +153,8 @@ def _config_source(config: Config) -> str:
     """`load_config` with what differs from the profile `paper` in the size `tiny`."""
     base = load_config("paper", "tiny")
     names = [field.name for field in dataclasses.fields(config)]
-    changed = [f"{name}={source(getattr(config, name))}" for name in names if getattr(config, name) != getattr(base, name)]
+    changed = [
+        f"{name}={source(getattr(config, name))}" for name in names if getattr(config, name) != getattr(base, name)
+    ]
     arguments = ", ".join(["'paper'", "'tiny'", *changed])
     return f"load_config({arguments})"

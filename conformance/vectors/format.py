@@ -28,7 +28,9 @@ EPOCH = (1980, 1, 1, 0, 0, 0)
 class Table:
     """The arrays and the objects of one file, each under a name of its own."""
 
-    def __init__(self, arrays: Mapping[str, np.ndarray] | None = None, objects: Mapping[str, Any] | None = None) -> None:
+    def __init__(
+        self, arrays: Mapping[str, np.ndarray] | None = None, objects: Mapping[str, Any] | None = None
+    ) -> None:
         self.arrays = dict(arrays or {})
         self.objects = dict(objects or {})
         self._names: dict[bytes, str] = {}
@@ -115,7 +117,9 @@ def to_npz(arrays: Mapping[str, np.ndarray]) -> bytes:
             member = zipfile.ZipInfo(f"{name}.npy", EPOCH)
             member.compress_type, member.create_system, member.external_attr = zipfile.ZIP_DEFLATED, 3, 0o644 << 16
             content = io.BytesIO()
-            np.lib.format.write_array(content, array.astype(array.dtype.newbyteorder("<")), version=(1, 0), allow_pickle=False)
+            np.lib.format.write_array(
+                content, array.astype(array.dtype.newbyteorder("<")), version=(1, 0), allow_pickle=False
+            )
             archive.writestr(member, content.getvalue(), compresslevel=9)
     return file.getvalue()
 

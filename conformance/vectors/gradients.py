@@ -1,4 +1,5 @@
-"""Gradients of the losses that are functions of a few arrays, from differences of the reference with its stop-gradients held constant."""
+"""Gradients of the losses that are functions of a few arrays, from differences of the reference with its stop-gradients
+held constant."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -38,7 +39,8 @@ SMALLEST_SCALE = 1e-3
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Gradient:
-    """The derivative of the sum of all entries of the result at `of` by an argument, and what its tolerance is relative to."""
+    """The derivative of the sum of all entries of the result at `of` by an argument, and what its tolerance is relative
+    to."""
 
     of: Path
     by: str
@@ -48,7 +50,8 @@ class Gradient:
 
 
 def gradients(vector: Vector) -> list[Gradient]:
-    """The gradients of a vector whose function is a loss; those that cannot be found exactly, beside infinities and kinks, are left out."""
+    """The gradients of a vector whose function is a loss; those that cannot be found exactly, beside infinities and
+    kinks, are left out."""
     found = []
     for by in BY.get(vector.function, ()):
         place = INTERFACE[vector.function].index(by)
@@ -87,7 +90,9 @@ def _derivatives(vector: Vector, place: int, argument: np.ndarray, steps: np.nda
         # Differences of fourth order, with a step and with half of it.
         coarse[:, index] = (8 * (values[2] - values[-2]) - (values[4] - values[-4])) / (12 * step)
         fine[:, index] = (8 * (values[1] - values[-1]) - (values[2] - values[-2])) / (6 * step)
-    exact = [np.all(np.abs(c - f) <= ERROR * max(SMALLEST_SCALE, np.abs(f).max())) for c, f in zip(coarse, fine, strict=True)]
+    exact = [
+        np.all(np.abs(c - f) <= ERROR * max(SMALLEST_SCALE, np.abs(f).max())) for c, f in zip(coarse, fine, strict=True)
+    ]
     return [f.reshape(argument.shape) if good else None for f, good in zip(fine, exact, strict=True)]
 
 

@@ -9,11 +9,16 @@ from conformance.vectors.reading import Case, deviations
 
 
 def kills(case: Case) -> list[str]:
-    """The names of the mutants that deviate from the case, or raise in it. Only those that change what the case calls are run."""
+    """The names of the mutants that deviate from the case, or raise in it. Only those that change what the case calls
+    are run."""
     entered: set[str] = set()
     with tracing(entered), np.errstate(all="ignore"):
         deviations(case, NumpyAdapter(), "float64")
-    return [name for name, mutant in MUTANTS.items() if entered & mutant.replacements.keys() and _deviates(case, MutantAdapter(mutant))]
+    return [
+        name
+        for name, mutant in MUTANTS.items()
+        if entered & mutant.replacements.keys() and _deviates(case, MutantAdapter(mutant))
+    ]
 
 
 def _deviates(case: Case, adapter: object) -> bool:

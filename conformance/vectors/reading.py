@@ -28,7 +28,11 @@ class Case:
     @property
     def dtypes(self) -> set[str]:
         """The dtypes that it has tolerances for; every one where the call must be refused."""
-        return set(self.floor) if "refused" in self.entry else {dtype for result in self.entry["results"] for dtype in result["tolerance"]}
+        return (
+            set(self.floor)
+            if "refused" in self.entry
+            else {dtype for result in self.entry["results"] for dtype in result["tolerance"]}
+        )
 
     def arguments(self, dtype: str = "float64") -> tuple[Any, ...]:
         return tuple(self.table.decode(value, dtype) for value in self.entry["arguments"].values())
@@ -47,10 +51,13 @@ def read_index(directory: Path) -> dict[str, Any]:
         index: dict[str, Any] = json.loads(read_text(directory / "index.json"))
     except (UserError, ValueError) as error:
         raise UserError(
-            f"no vectors in {directory}: it has no index.json that can be read; write some with: conformance vectors --out {directory}"
+            f"no vectors in {directory}: it has no index.json that can be read; write some with: conformance "
+            f"vectors --out {directory}"
         ) from error
     if index.get("format") != FORMAT:
-        raise UserError(f"{directory} has vectors of the format {index.get('format')!r}, expected {FORMAT}; write them anew")
+        raise UserError(
+            f"{directory} has vectors of the format {index.get('format')!r}, expected {FORMAT}; write them anew"
+        )
     return index
 
 
@@ -72,10 +79,16 @@ def deviations(case: Case, adapter: object, dtype: str) -> list[str]:
         try:
             function(*arguments)
         except ValueError as error:
-            return [f"the message {str(error)!r} does not hold {word!r}" for word in refused["naming"] if word not in str(error)]
+            return [
+                f"the message {str(error)!r} does not hold {word!r}"
+                for word in refused["naming"]
+                if word not in str(error)
+            ]
         return ["not refused"]
     actual = function(*arguments)
-    found = (_deviation(case, result, actual, dtype) for result in case.entry["results"] if dtype in result["tolerance"])
+    found = (
+        _deviation(case, result, actual, dtype) for result in case.entry["results"] if dtype in result["tolerance"]
+    )
     return [message for message in found if message]
 
 
@@ -87,6 +100,8 @@ def _deviation(case: Case, result: Mapping[str, Any], actual: Any, dtype: str) -
     if actual.shape != expected.shape:
         return f"{where}: expected shape {expected.shape}, got {actual.shape}"
     magnitude = None if scale == "expected" else case.table.decode(scale, dtype)
-    largest = float(relative_deviation(actual, expected, scale_of(expected, magnitude, case.floor[dtype])).max(initial=0.0))
+    largest = float(
+        relative_deviation(actual, expected, scale_of(expected, magnitude, case.floor[dtype])).max(initial=0.0)
+    )
     tolerance = result["tolerance"][dtype]
     return f"{where}: off by {largest:.3g}, allowed {tolerance:.3g}" if largest > tolerance else ""

@@ -1,8 +1,9 @@
 """From checks to vectors: what a check asks of the reference, and what it accepts, is written down as it runs.
 
-A check hands the result of `run.call`, or a part of it, to `run.compare` or `run.exact`. The recorder knows results by their identity, so
-it sees which calls are compared, and how closely. A right result that was made from another result of the candidate is a relation between
-calls and no golden value; it is told apart by a second run on a reference whose results are all a little off.
+A check hands the result of `run.call`, or a part of it, to `run.compare` or `run.exact`. The recorder knows results by
+their identity, so it sees which calls are compared, and how closely. A right result that was made from another result
+of the candidate is a relation between calls and no golden value; it is told apart by a second run on a reference whose
+results are all a little off.
 """
 
 import contextlib
@@ -32,7 +33,8 @@ ATTEMPTS = 100
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Output:
-    """One array of a result: what is right, what its rounding is relative to (None: itself), and the tolerance in units of that."""
+    """One array of a result: what is right, what its rounding is relative to (None: itself), and the tolerance in units
+    of that."""
 
     path: Path
     expected: np.ndarray
@@ -59,8 +61,11 @@ class _Comparison:
     bound: float
 
     def rejects(self, result: np.ndarray) -> bool:
-        """Whether the check does not accept the reference's own result: it asks for rounding that the reference does not do."""
-        return bool(np.any(relative_deviation(result, self.expected, scale_of(self.expected, self.scale, 0.0)) > self.bound))
+        """Whether the check does not accept the reference's own result: it asks for rounding that the reference does
+        not do."""
+        return bool(
+            np.any(relative_deviation(result, self.expected, scale_of(self.expected, self.scale, 0.0)) > self.bound)
+        )
 
 
 @dataclasses.dataclass(eq=False)
@@ -73,7 +78,8 @@ class _Call:
 
 
 class Recorder(Run):
-    """A run that judges nothing and remembers every call and comparison. Inputs are such that every dtype holds them."""
+    """A run that judges nothing and remembers every call and comparison. Inputs are such that every dtype holds
+    them."""
 
     def __init__(self, adapter: object, dtype: str, profile: str, seed: int, examples: int) -> None:
         super().__init__(adapter, dtype, profile, seed, examples)
@@ -107,7 +113,14 @@ class Recorder(Run):
         self.compare(where, actual, expected, magnitude=1.0, bound=0.0)
 
     def compare(
-        self, where: str, actual: Any, expected: Any, *, magnitude: Any = None, factor: float = 1.0, bound: float | None = None
+        self,
+        where: str,
+        actual: Any,
+        expected: Any,
+        *,
+        magnitude: Any = None,
+        factor: float = 1.0,
+        bound: float | None = None,
     ) -> None:
         origin = self._origin(actual)
         if origin is None:
@@ -118,7 +131,8 @@ class Recorder(Run):
             call.compared.setdefault(path, _Comparison(part, _scale(size, part), allowed))
 
     def for_all(self, **strategies: Any) -> Callable[[Callable[..., None]], None]:
-        """Draws the cases from bytes of NumPy's generator: hypothesis's own depends on the code that happens to be imported."""
+        """Draws the cases from bytes of NumPy's generator: hypothesis's own depends on the code that happens to be
+        imported."""
 
         def decorate(body: Callable[..., None]) -> None:
             left = self.examples
@@ -128,7 +142,9 @@ class Recorder(Run):
                 left -= 1
                 body(**drawn)
 
-            quiet = hypothesis.settings(database=None, deadline=None, suppress_health_check=list(hypothesis.HealthCheck))
+            quiet = hypothesis.settings(
+                database=None, deadline=None, suppress_health_check=list(hypothesis.HealthCheck)
+            )
             test: Any = quiet(hypothesis.given(**strategies)(counted))
             self._drawn += 1
             rng = np.random.default_rng([self.seed, self._drawn])
@@ -144,12 +160,20 @@ class Recorder(Run):
             return self._last[1], ()
         if known := self._origins.get(id(actual)):
             return known
-        entries = list(actual.items()) if isinstance(actual, Mapping) else list(enumerate(actual)) if isinstance(actual, tuple) else []
+        entries = (
+            list(actual.items())
+            if isinstance(actual, Mapping)
+            else list(enumerate(actual))
+            if isinstance(actual, tuple)
+            else []
+        )
         origins = [(key, self._origins.get(id(value))) for key, value in entries]
         if not origins or origins[0][1] is None:
             return None
         call, base = origins[0][1][0], origins[0][1][1][:-1]
-        together = all(origin is not None and origin[0] is call and origin[1] == (*base, key) for key, origin in origins)
+        together = all(
+            origin is not None and origin[0] is call and origin[1] == (*base, key) for key, origin in origins
+        )
         return (call, base) if together else None
 
     _last: tuple[Any, Any] = (object(), None)
@@ -182,7 +206,8 @@ def record(check: Check, profile: str, seed: int, examples: int) -> list[Vector]
 def _record(check: Check, inputs: str, profile: str, seed: int, examples: int) -> list[Vector]:
     """The vectors with the inputs of a dtype. The tolerances of the others come from runs of their own.
 
-    There the same calls count. Of a more precise dtype, for which checks may draw closer to a boundary, every call is the same.
+    There the same calls count. Of a more precise dtype, for which checks may draw closer to a boundary, every call is
+    the same.
     """
 
     def run(adapter: object, dtype: str) -> list[_Call]:
@@ -194,7 +219,9 @@ def _record(check: Check, inputs: str, profile: str, seed: int, examples: int) -
     calls = run(NumpyAdapter(), inputs)
     if not any(call.compared or call.refused is not None for call in calls):
         return []
-    others = {dtype: calls if dtype == inputs else run(NumpyAdapter(), dtype) for dtype in DTYPES if dtype in check.dtypes}
+    others = {
+        dtype: calls if dtype == inputs else run(NumpyAdapter(), dtype) for dtype in DTYPES if dtype in check.dtypes
+    }
     shifted: list[_Call] = []
     with contextlib.suppress(Exception):  # what a check makes of results that are off need not be sound
         shifted = run(Shifted(), inputs)
@@ -203,18 +230,22 @@ def _record(check: Check, inputs: str, profile: str, seed: int, examples: int) -
         twins = {
             dtype: other[index]
             for dtype, other in others.items()
-            if _same_call(other, index, call) and (EPSILON[dtype] < EPSILON[inputs] or _same(other[index].arguments, call.arguments))
+            if _same_call(other, index, call)
+            and (EPSILON[dtype] < EPSILON[inputs] or _same(other[index].arguments, call.arguments))
         }
         golden = _golden(call, shifted[index]) if _same_call(shifted, index, call) else []
         outputs = tuple(output for path in golden if (output := _output(call, path, twins)) is not None)
         if outputs or call.refused is not None:
             arguments = _without_unread(call.function, call.arguments) if outputs else call.arguments
-            vectors.append(Vector(f"{check.name}/{len(vectors)}", check, call.function, arguments, outputs, call.refused))
+            vectors.append(
+                Vector(f"{check.name}/{len(vectors)}", check, call.function, arguments, outputs, call.refused)
+            )
     return vectors
 
 
 def along_one_direction(vector: Vector) -> Vector:
-    """A vector of `loss_derivatives` with the first of its directions alone, rounded to numbers that take little room."""
+    """A vector of `loss_derivatives` with the first of its directions alone, rounded to numbers that take little
+    room."""
     *others, directions = vector.arguments
     direction = {name: round_to(value, "bfloat16") for name, value in directions[0].items()}
     derivatives = NumpyAdapter().loss_derivatives(*snapshot(tuple(others)), [direction])
@@ -262,7 +293,11 @@ def _same(value: Any, other: Any) -> bool:
     if isinstance(value, Config):
         return isinstance(other, Config) and dataclasses.replace(value, compute_dtype=other.compute_dtype) == other
     if isinstance(value, Mapping):
-        return isinstance(other, Mapping) and value.keys() == other.keys() and all(_same(value[key], other[key]) for key in value)
+        return (
+            isinstance(other, Mapping)
+            and value.keys() == other.keys()
+            and all(_same(value[key], other[key]) for key in value)
+        )
     if isinstance(value, tuple):
         return isinstance(other, tuple) and len(value) == len(other) and all(map(_same, value, other))
     if isinstance(value, np.ndarray):
@@ -275,12 +310,14 @@ def _golden(call: _Call, shifted: _Call) -> list[Path]:
     return [
         path
         for path, comparison in call.compared.items()
-        if path in shifted.compared and np.array_equal(comparison.expected, shifted.compared[path].expected, equal_nan=True)
+        if path in shifted.compared
+        and np.array_equal(comparison.expected, shifted.compared[path].expected, equal_nan=True)
     ]
 
 
 def _output(call: _Call, path: Path, twins: Mapping[str, _Call]) -> Output | None:
-    """The reference's own result, which has all its digits where a check writes seven, with the tolerance of every dtype."""
+    """The reference's own result, which has all its digits where a check writes seven, with the tolerance of every
+    dtype."""
     expected = call.result
     for key in path:
         expected = expected[key]
@@ -289,7 +326,11 @@ def _output(call: _Call, path: Path, twins: Mapping[str, _Call]) -> Output | Non
     tolerance = {}
     for dtype, twin in twins.items():
         comparison = twin.compared.get(path)
-        if comparison is not None and not (dtype != "float64" and overflows) and not (dtype == "bfloat16" and comparison.rejects(expected)):
+        if (
+            comparison is not None
+            and not (dtype != "float64" and overflows)
+            and not (dtype == "bfloat16" and comparison.rejects(expected))
+        ):
             tolerance[dtype] = comparison.bound
     return Output(path, expected, call.compared[path].scale, tolerance) if tolerance else None
 
@@ -299,7 +340,9 @@ def _aligned(expected: Any, magnitude: Any, path: Path) -> Iterator[tuple[Path, 
     if isinstance(expected, Mapping | tuple):
         entries = expected.items() if isinstance(expected, Mapping) else enumerate(expected)
         for key, value in entries:
-            yield from _aligned(value, magnitude[key] if isinstance(magnitude, type(expected)) else magnitude, (*path, key))
+            yield from _aligned(
+                value, magnitude[key] if isinstance(magnitude, type(expected)) else magnitude, (*path, key)
+            )
     else:
         yield path, np.array(expected, np.float64), magnitude
 

@@ -25,7 +25,11 @@ from conformance.vectors.killing import kills
 from conformance.vectors.reading import Case
 from conformance.vectors.recording import Output, Vector, along_one_direction, record
 
-FLOOR = {dtype: SMALLEST_NORMAL[wide] / EPSILON[wide] for dtype in DTYPES for wide in ["float64" if dtype == "float64" else "float32"]}
+FLOOR = {
+    dtype: SMALLEST_NORMAL[wide] / EPSILON[wide]
+    for dtype in DTYPES
+    for wide in ["float64" if dtype == "float64" else "float32"]
+}
 """The smallest scale of a tolerance: transforms, returns and losses are computed in float32 or better."""
 
 
@@ -33,8 +37,9 @@ FLOOR = {dtype: SMALLEST_NORMAL[wide] / EPSILON[wide] for dtype in DTYPES for wi
 class Size:
     """How much of what the checks do a set holds.
 
-    examples: drawn for each property. results, refused: the most cases of each kind for one function of a check. large, bytes: of cases
-    with more than `large` bytes of arrays there is one at most, with a result, and none with more than `bytes`, or `whole` for WHOLE.
+    examples: drawn for each property. results, refused: the most cases of each kind for one function of a check. large,
+    bytes: of cases with more than `large` bytes of arrays there is one at most, with a result, and none with more than
+    `bytes`, or `whole` for WHOLE.
     """
 
     examples: int
@@ -48,7 +53,12 @@ class Size:
 SETS = {"minimal": Size(2, 2, 1, 600, 8_000, 45_000), "full": Size(25, 10_000, 10_000, 2**40, 2**40, 2**40)}
 WHOLE = (
     *("agent.losses_match", "agent.loss_derivatives_match", "agent.policy_step_matches", "given.losses_given_match"),
-    *("networks.decoder_matches", "world_model.open_loop_matches", "given.observe_given_matches", "rssm.observe_matches"),
+    *(
+        "networks.decoder_matches",
+        "world_model.open_loop_matches",
+        "given.observe_given_matches",
+        "rssm.observe_matches",
+    ),
 )
 """Checks of so much at once that their smallest case is large."""
 
@@ -79,9 +89,14 @@ def write_vectors(
             cases += [entry for vector in vectors if (entry := describe_case(vector, table)) is not None]
             if not vectors:
                 why = "large: in the full set" if recorded else "no golden value"
-                left_out.append({"check": check.name, "requirements": list(check.requirements), "what": check.summary, "why": why})
+                left_out.append(
+                    {"check": check.name, "requirements": list(check.requirements), "what": check.summary, "why": why}
+                )
         if cases:
-            files[f"{row}.json"], files[f"{row}.npz"] = to_json({"objects": table.objects, "cases": cases}), to_npz(table.arrays)
+            files[f"{row}.json"], files[f"{row}.npz"] = (
+                to_json({"objects": table.objects, "cases": cases}),
+                to_npz(table.arrays),
+            )
             names[f"{row}.json"] = [case["name"] for case in cases]
     index = {
         "format": FORMAT,
@@ -91,7 +106,9 @@ def write_vectors(
         "profile": profile,
         "seed": seed,
         "floor": FLOOR,
-        "files": {name: _about(content) | ({"cases": names[name]} if name in names else {}) for name, content in files.items()},
+        "files": {
+            name: _about(content) | ({"cases": names[name]} if name in names else {}) for name, content in files.items()
+        },
         "left_out": left_out,
     }
     with _writing(directory):
@@ -104,7 +121,10 @@ def write_vectors(
 
 def checks_to_record(only: str = "") -> list[Check]:
     """The checks of every dtype whose name or requirement ids contain `only`, in the order of their names."""
-    return sorted({check.name: check for dtype in DTYPES for check in selected_checks(dtype, only)}.values(), key=lambda check: check.name)
+    return sorted(
+        {check.name: check for dtype in DTYPES for check in selected_checks(dtype, only)}.values(),
+        key=lambda check: check.name,
+    )
 
 
 def selected(vectors: Iterable[Vector], size: Size) -> Iterator[Vector]:
@@ -125,10 +145,13 @@ def selected(vectors: Iterable[Vector], size: Size) -> Iterator[Vector]:
 
 
 def describe_case(vector: Vector, table: Table) -> dict[str, Any] | None:
-    """The entry of a vector in the JSON file of its row, its arrays in the table; None if it has an argument that JSON cannot write."""
+    """The entry of a vector in the JSON file of its row, its arrays in the table; None if it has an argument that JSON
+    cannot write."""
     check = vector.check
     try:
-        arguments = {name: table.encode(value) for name, value in zip(INTERFACE[vector.function], vector.arguments, strict=True)}
+        arguments = {
+            name: table.encode(value) for name, value in zip(INTERFACE[vector.function], vector.arguments, strict=True)
+        }
     except TypeError:
         return None
     entry: dict[str, Any] = {
@@ -218,7 +241,13 @@ def weight(vector: Vector) -> int:
 def _bytes(value: Any) -> int:
     if isinstance(value, dict):
         return sum(map(_bytes, value.values()))
-    return sum(map(_bytes, value)) if isinstance(value, tuple) else shortest(value).nbytes if isinstance(value, np.ndarray) else 0
+    return (
+        sum(map(_bytes, value))
+        if isinstance(value, tuple)
+        else shortest(value).nbytes
+        if isinstance(value, np.ndarray)
+        else 0
+    )
 
 
 def package_version() -> str:
@@ -226,4 +255,8 @@ def package_version() -> str:
     try:
         return importlib.metadata.version("dreamer-spec")
     except importlib.metadata.PackageNotFoundError:
-        return str(tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"])
+        return str(
+            tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text(encoding="utf-8"))["project"][
+                "version"
+            ]
+        )

@@ -1,0 +1,217 @@
+"""Tasks by name.
+
+gym:ID              any registered Gymnasium id, also one that a module registers: gym:CartPole-v1, gym:ALE/Pong-v5,
+gym:module:ID dmc:DOMAIN-TASK     DeepMind Control Suite from vectors: dmc:walker-walk dmc_vision:DOMAIN-TASK   the same
+from 64 x 64 images only MODULE:CALLABLE     your own: a function or class that returns a gymnasium.Env:
+my_package.my_module:make_env
+"""
+
+import contextlib
+import functools
+import importlib
+import inspect
+import sys
+import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+
+from dreamer_spec import arguments as keywords
+from dreamer_spec.envs.adapter import ContractEnv
+from dreamer_spec.envs.info import names_of
+from dreamer_spec.errors import UserError
+from dreamer_spec.options import Options
+
+SUITES = "gym:ID, dmc:DOMAIN-TASK, dmc_vision:DOMAIN-TASK or MODULE:CALLABLE"
+
+# Namespace of a Gymnasium id -> the package that registers it, and our extra that installs it. Folder inside Gymnasium
+# -> our extra.
+_NAMESPACES = {"ALE": ("ale_py", "atari")}
+_EXTRAS = {"box2d": "box2d", "mujoco": "mujoco", "classic_control": "train"}
+
+
+def env_maker(options: Options, render: bool = False) -> Callable[[int], ContractEnv]:
+    """index -> the environment that these options describe."""
+    return functools.partial(
+        make_env,
+        options.task,
+        image_size=options.image_size,
+        action_repeat=options.action_repeat,
+        info_metrics=names_of(options.info_metrics),
+        render=render,
+        arguments=options.env_arg,
+        time_limit=options.time_limit,
+        observations=options.observations,
+        leave_out=options.leave_out,
+    )
+
+
+def make_env(
+    task: str,
+    index: int = 0,
+    image_size: int = 64,
+    action_repeat: int = 1,
+    info_metrics: Sequence[str] = (),
+    render: bool = False,
+    arguments: Mapping[str, Any] | None = None,
+    time_limit: int | None = None,
+    observations: Sequence[str] = (),
+    leave_out: Sequence[str] = (),
+) -> ContractEnv:
+    """The environment of a task string, adapted. `index` numbers the instances of a run, for messages. render: with the
+    render mode "rgb_array", where the environment has one. arguments: keyword arguments with which the environment is
+    made. time_limit: frames after which an episode is truncated, in place of the suite's limit: [LOOP-62]. The others:
+    see `ContractEnv`.
+
+    Raises:
+      UserError: an unknown task, a package that is not installed (with the pip command), arguments that the environment
+      does not take, an unsupported space.
+    """
+    suite, separator, name = task.partition(":")
+    if not separator or not suite or not name:
+        raise UserError(f"unknown task {task!r}; expected {SUITES}")
+    arguments = arguments or {}
+    if suite == "gym":
+        env = _make_gymnasium(task, name, render, arguments, time_limit)
+    elif suite in ("dmc", "dmc_vision"):
+        if arguments:
+            raise UserError(f"task {task} takes no keyword arguments, and --env-arg {next(iter(arguments))} was given")
+        env = _limited(_make_dm_control(task, name, suite == "dmc_vision", image_size, render, time_limit), time_limit)
+    else:
+        env = _limited(_make_own(task, suite, name, render, arguments), time_limit)
+    return ContractEnv(env, task, index, image_size, action_repeat, info_metrics, observations, leave_out)
+
+
+def _limited(env: gymnasium.Env[Any, Any], time_limit: int | None) -> gymnasium.Env[Any, Any]:
+    return gymnasium.wrappers.TimeLimit(env, time_limit) if time_limit else env
+
+
+def _make_gymnasium(
+    task: str, name: str, render: bool, arguments: Mapping[str, Any], time_limit: int | None
+) -> gymnasium.Env[Any, Any]:
+    namespace = name.split("/")[0]
+    if namespace in _NAMESPACES:
+        module, extra = _NAMESPACES[namespace]
+        gymnasium.register_envs(_import(module, extra, task))
+    if ":" in name:
+        _import_own(task, name.split(":")[0])
+    if "max_episode_steps" in arguments:  # Gymnasium's own, which would be set twice.
+        raise UserError(f"--env-arg max_episode_steps is no argument of {task}; the option is --time-limit N")
+    given = {"disable_env_checker": True, **arguments} | ({"max_episode_steps": time_limit} if time_limit else {})
+    try:
+        if render:
+            with contextlib.suppress(TypeError):  # It takes no render_mode.
+                return gymnasium.make(name, **{**given, "render_mode": "rgb_array"})
+        with _naming(task, arguments):
+            return gymnasium.make(name, **given)
+    except gymnasium.error.DependencyNotInstalled as error:
+        raise UserError(f"task {task} needs another package: {_gymnasium_extra(name) or error}") from error
+    except ModuleNotFoundError as error:
+        raise UserError(
+            f"task {task} needs the package {error.name}: {_gymnasium_extra(name) or 'install it with pip'}"
+        ) from error
+    except gymnasium.error.Error as error:
+        is_known = name.rpartition(":")[2] in gymnasium.registry
+        raise UserError(
+            f"{f'task {task}{_given(arguments)}' if is_known else f'unknown task {task!r}'}: {error}"
+        ) from error
+    except RuntimeError as error:
+        if "MUJOCO_GL" not in str(error):  # What MuJoCo says of a value that it does not know.
+            raise
+        raise UserError(f"task {task}: {error}; set it to egl, osmesa or disabled, or unset it") from error
+
+
+class Refusal(UserError):
+    """An environment could not be made with its arguments. Not certainly because of them: another attempt may do
+    better."""
+
+
+@contextlib.contextmanager
+def _naming(task: str, arguments: Mapping[str, Any]) -> Iterator[None]:
+    """What the code of an environment raises of keyword arguments that it cannot use becomes a line that names them."""
+    try:
+        yield
+    except (TypeError, ValueError, LookupError, AttributeError, AssertionError) as error:
+        if not arguments:
+            raise
+        line = f"task {task}{_given(arguments)}: {type(error).__name__}: {error}"
+        if "keyword argument" in str(error):
+            raise UserError(line) from error
+        raise Refusal(line, traceback.format_exc()) from error
+
+
+def _given(arguments: Mapping[str, Any]) -> str:
+    return "".join(f" --env-arg {argument}" for argument in keywords.write(arguments))
+
+
+def _gymnasium_extra(name: str) -> str:
+    """How to install what an id of Gymnasium itself needs; empty for others."""
+    spec = gymnasium.registry.get(name)
+    entry_point = str(spec.entry_point) if spec else ""
+    return next((_pip(extra) for folder, extra in _EXTRAS.items() if f"gymnasium.envs.{folder}" in entry_point), "")
+
+
+def _make_dm_control(
+    task: str, name: str, vision: bool, image_size: int, render: bool, time_limit: int | None
+) -> gymnasium.Env[Any, Any]:
+    domain, _, control_task = name.partition("-")
+    try:
+        adapter = importlib.import_module("dreamer_spec.envs.dm_control")
+        env: gymnasium.Env[Any, Any] = adapter.make(
+            task, domain, control_task, image_size if vision else None, renders=render, limited=not time_limit
+        )
+    except ModuleNotFoundError as error:
+        raise UserError(f"task {task} needs the package {error.name}: {_pip('dm-control')}") from error
+    return env
+
+
+def _make_own(
+    task: str, module_name: str, name: str, render: bool, arguments: Mapping[str, Any]
+) -> gymnasium.Env[Any, Any]:
+    module = _import_own(task, module_name)
+    function = getattr(module, name, None)
+    if not callable(function):
+        raise UserError(f"unknown task {task!r}: the module {module_name!r} has no function or class {name!r}")
+    if render and "render_mode" in inspect.signature(function).parameters:
+        arguments = {**arguments, "render_mode": "rgb_array"}
+    with _naming(task, arguments):
+        env = function(**arguments)
+    if not isinstance(env, gymnasium.Env):
+        raise UserError(f"task {task}: {name}() returned a {type(env).__name__}; expected a gymnasium.Env")
+    return env
+
+
+def _import_own(task: str, module_name: str) -> Any:
+    """A module of the user's. A console script does not look for modules where it is started; they usually lie
+    there."""
+    if module_name.startswith(".") or "/" in module_name or module_name.endswith(".py"):
+        module = Path(module_name).name.removesuffix(".py") or "my_module"
+        raise UserError(
+            f"unknown task {task!r}: {module_name!r} is a file, and a task names a module, "
+            f"as `import` does: {module}:make_env"
+        )
+    with contextlib.suppress(FileNotFoundError):  # It has been removed.
+        here = str(Path.cwd())
+        if here not in sys.path and "" not in sys.path:
+            sys.path.insert(0, here)
+    try:
+        return importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{module_name}.".startswith(f"{error.name}."):
+            raise  # The module is there; something that it imports is not.
+        raise UserError(
+            f"unknown task {task!r}: no suite and no module named {module_name!r}; expected {SUITES}"
+        ) from error
+
+
+def _import(module: str, extra: str, task: str) -> Any:
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        raise UserError(f"task {task} needs the package {error.name}: {_pip(extra)}") from error
+
+
+def _pip(extra: str) -> str:
+    return f"pip install 'dreamer-spec[{extra}]'"

@@ -1,0 +1,240 @@
+"""N environments side by side, each a stream of records as in spec/00-notation.md, and each restarted when it fails."""
+
+import collections
+import contextlib
+import dataclasses
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+
+import numpy as np
+
+from dreamer_spec.envs.adapter import ContractEnv
+from dreamer_spec.envs.failure import Failure
+from dreamer_spec.envs.history import Episode, History
+from dreamer_spec.envs.info import EpisodeInfo
+from dreamer_spec.envs.stream import Step
+from dreamer_spec.envs.trial import Trial, make_here, try_out
+from dreamer_spec.envs.worker import InProcess, OwnProcess, Worker, receive
+from dreamer_spec.errors import UserError
+from dreamer_spec.translation import Translation
+from reference_numpy.training_loop import derive_seed
+from spec import Spaces
+
+Record = dict[str, np.ndarray]
+
+WINDOW = 100_000  # records of all workers among which failures are counted
+CLOSING = 5.0  # seconds that environments have to close by themselves
+
+
+class Environments:
+    """`count` environments, in this process or in one process each.
+
+    make: index -> environment; must be picklable by cloudpickle.
+    timeout: seconds that a step, or a reset with the making before it, may take. Only a process of its own can be held
+    to it: an environment in this process that hangs stops everything, and nobody notices.
+    failures_allowed: within 100,000 records of all workers together. trial: what is known of these environments, if
+    they have been tried
+    out. task: for messages, where they have not.
+
+    `start(action)` sends the actions off, `finish()` waits for the records: what happens in between overlaps with the
+    environments where they have processes of their own. `reset(seeds)` begins everywhere anew, and seeds this episode
+    and all after it.
+
+    An environment that crashes, raises, hangs or returns what its spaces do not allow is restarted: another is made and
+    reset; its next record has `is_first`, and the others go on undisturbed: [LOOP-32].
+
+    Raises:
+      UserError: from here, if the first environment cannot be made; from `reset` and `finish`, if an environment gives
+      no first record in three attempts ([LOOP-46]), or if there were too many failures.
+    """
+
+    def __init__(
+        self,
+        make: Callable[[int], ContractEnv],
+        count: int,
+        processes: bool,
+        timeout: float = 600.0,
+        failures_allowed: int = 10,
+        trial: Trial | None = None,
+        task: str = "",
+    ) -> None:
+        self.count = count
+        self.failures = 0  # so far
+        self.info: list[dict[str, float]] = [
+            {}
+        ] * count  # of the last records that end an episode: the numbers chosen by --info-metrics
+        self._failures_allowed = failures_allowed
+        self._failed_at: collections.deque[int] = (
+            collections.deque()
+        )  # records before each failure, of those in the window
+        self._untold: list[Failure] = []
+        self._attempts = collections.Counter[int]()  # of each worker to give its first record
+        self._records = 0
+        first = None if processes else make_here(make, self._count, task)
+        known = first or trial or try_out(make, self._count, task, timeout=timeout)
+        self.translation: Translation = known.translation
+        self.spaces: Spaces = known.translation.spaces
+        self.frame_skip: int = known.frame_skip
+        self._episodes: dict[int, Episode] = {}
+        self._action = np.zeros((count, self.spaces.action_size), np.float32)
+        self._pending = False  # whether actions were sent off whose records have not been asked for
+        self._workers: list[Worker] = []
+        for index in range(count):
+            if processes:
+                self._workers.append(OwnProcess(make, index, known.task, self.translation, timeout))
+            else:
+                self._workers.append(InProcess(make, index, known.task, self.translation, None if index else first))
+
+    def reset(self, seeds: Sequence[int]) -> Record:
+        """The first records of new episodes, [N, ...] each."""
+        self._settle()
+        for worker, seed in enumerate(seeds):
+            self._begin(worker, self._fresh(seed))
+        return self._record(self._receive())
+
+    def start(self, action: np.ndarray) -> None:
+        """Sends flat actions [N, A]; where the last record was the last of an episode, the action is ignored."""
+        self._action, self._pending = np.array(action, np.float32), True
+        for worker, own in zip(self._workers, self._action, strict=True):
+            worker.step(own)
+
+    def finish(self) -> Record:
+        """The records that follow the actions, [N, ...] each."""
+        self._pending = False
+        return self._record(self._receive())
+
+    def step(self, action: np.ndarray) -> Record:
+        """`start` and `finish` in one."""
+        self.start(action)
+        return self.finish()
+
+    def histories(self) -> list[History | None]:
+        """What `restore` needs to come back to the last records, also while actions are on their way. [LOOP-34]
+
+        None for an episode that is too long to be kept.
+        """
+        return [self._episodes[worker].history() for worker in range(self.count)]
+
+    def restore(self, histories: Sequence[History | None]) -> Record | None:
+        """Plays every worker's episode again, and returns the last records: of deterministic environments those that
+        `finish` had returned, and from here on everything is as if nothing had been interrupted. [LOOP-34]
+
+        Returns:
+          The records [N, ...], to be compared with the saved ones; or None where a history is missing or cannot be
+          replayed. Then, and where they differ, `reset` must be called.
+        """
+        self._settle()
+        fitting = [
+            history for history in histories if history and history.actions.shape[1:] == (self.spaces.action_size,)
+        ]
+        if len(fitting) != self.count:
+            return None
+        for worker, history in enumerate(fitting):
+            self._begin(worker, history)
+            self._action[worker] = history.actions[-1] if len(history.actions) else 0
+        steps, failures = self._ask(range(self.count))
+        for failure in failures:
+            self._end(failure)
+        return None if failures else self._record(steps)
+
+    @contextlib.contextmanager
+    def lend(self) -> Iterator[None]:
+        """Inside, other episodes may be played. Afterwards `histories` says what it said before, and `next_episodes`
+        must be called."""
+        self._settle()
+        episodes, action = dict(self._episodes), self._action
+        try:
+            yield
+        finally:
+            self._settle()
+            self._episodes, self._action = episodes, action
+
+    def next_episodes(self) -> Record:
+        """The first records [N, ...] of the episodes that follow those whose last records were given, as `finish` would
+        give them."""
+        for worker, episode in self._episodes.items():
+            self._begin(worker, dataclasses.replace(self._fresh(episode.seed), episode=episode.number + 1))
+        return self._record(self._receive())
+
+    def take_failures(self) -> list[Failure]:
+        """The failures since the last call."""
+        told, self._untold = self._untold, []
+        return told
+
+    def close(self) -> None:
+        """Ends everything, within seconds, whatever the environments do (unless they are in this process)."""
+        deadline = time.monotonic() + CLOSING
+        for worker in self._workers:
+            worker.shut()
+        for worker in self._workers:
+            worker.kill(deadline)
+
+    def _fresh(self, seed: int) -> History:
+        return History(seed, 0, np.zeros((0, self.spaces.action_size), np.float32))
+
+    def _settle(self) -> None:
+        """Takes the answers that nobody wants any more."""
+        if self._pending:
+            self.finish()
+
+    def _begin(self, worker: int, history: History) -> None:
+        self._workers[worker].begin(history)
+        self._episodes[worker] = Episode(history)
+
+    def _receive(self) -> dict[int, Step]:
+        """One step of every worker; those that fail are restarted until they give the first record of an episode:
+        [LOOP-32]."""
+        steps, failures = self._ask(range(self.count))
+        while failures:
+            for failure in failures:
+                self._count(failure)
+                self._end(failure)
+                self._begin(failure.worker, self._fresh(derive_seed(self._episodes[failure.worker].seed, "restart", 0)))
+            again, failures = self._ask([failure.worker for failure in failures])
+            steps |= again
+        return steps
+
+    def _ask(self, workers: Iterable[int]) -> tuple[dict[int, Step], list[Failure]]:
+        """What the workers have done, and what went wrong."""
+        answers = receive({worker: self._workers[worker] for worker in workers})
+        steps = {worker: answer for worker, answer in answers.items() if not isinstance(answer, Failure)}
+        return steps, [answer for answer in answers.values() if isinstance(answer, Failure)]
+
+    def _count(self, failure: Failure) -> None:
+        """Raises a UserError where there were too many."""
+        self.failures += 1
+        self._untold.append(failure)
+        self._failed_at.append(self._records)
+        while self._failed_at[0] <= self._records - WINDOW:
+            self._failed_at.popleft()
+        self._attempts[failure.worker] += not self._records
+        if not self._records and failure.is_final(self._attempts[failure.worker]):
+            raise failure.error(self._attempts[failure.worker])
+        if len(self._failed_at) > self._failures_allowed:
+            raise UserError(
+                f"{failure.message}; the environments failed {len(self._failed_at)} times within {WINDOW:,} records, "
+                f"and {self._failures_allowed} are allowed (--env-failures)",
+                failure.details,
+            )
+
+    def _end(self, failure: Failure) -> None:
+        worker = self._workers[failure.worker]
+        worker.shut()
+        worker.kill(time.monotonic() + (0 if failure.kind == "timeout" else CLOSING))
+
+    def _record(self, steps: Mapping[int, Step]) -> Record:
+        """The steps side by side, in memory of their own."""
+        for worker, episode in self._episodes.items():
+            if episode.is_last:
+                self._episodes[worker] = episode = episode.next()
+            episode.add(self._action[worker], is_last=bool(steps[worker][2] or steps[worker][3]))
+        self._records += self.count
+        self.info = [steps[worker][4].get("metrics", EpisodeInfo()).values for worker in range(self.count)]
+        observations, rewards, terminated, _, _ = zip(*(steps[worker] for worker in range(self.count)), strict=True)
+        return {
+            **{key: np.stack([observation[key] for observation in observations]) for key in self.spaces.observations},
+            "reward": np.array(rewards, np.float32),
+            "is_first": np.array([episode.records == 1 for episode in self._episodes.values()]),
+            "is_last": np.array([episode.is_last for episode in self._episodes.values()]),
+            "is_terminal": np.array(terminated, bool),
+        }

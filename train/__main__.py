@@ -1,8 +1,0 @@
-"""`python -m train` is the command `train`."""
-
-import sys
-
-from train.cli import main
-
-if __name__ == "__main__":
-    sys.exit(main())
