@@ -15,7 +15,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from conformance.check import DTYPES
+from conformance.compare import DTYPES
 from spec import Config, Parameter, Spaces
 
 Array = np.ndarray

@@ -3,16 +3,39 @@
 import dataclasses
 import math
 import traceback
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from typing import Any
 
-from conformance.check import CHECKS, Call, CandidateLost, Check, Deviation, Run, Worst
+import numpy as np
+
+from conformance.adapters.numpy_adapter import NumpyAdapter
+from conformance.case import Call, Setting
+from conformance.check import CHECKS, Check
+from conformance.compare import CandidateLost, Comparisons, Deviation, Worst
+from conformance.judge import Ask, asking, judge_cases, standing_in
 from conformance.requirements import requirements
+from conformance.script import Script
 from conformance.strategies import ordinary_numbers
 from spec import editions
 
 FAILING = ("fail", "error")
 NOT_IMPLEMENTED = "not implemented: "
 """How the message of a check begins that is not offered because the candidate raised a `NotImplementedError`."""
+
+
+@dataclasses.dataclass(frozen=True)
+class FailedCall:
+    """The call where a check failed, and the comparison that went wrong.
+
+    got and expected: the two arrays that disagree, None where no arrays were compared. index: of the worst element,
+    None where shapes differ.
+    """
+
+    function: str
+    arguments: tuple[Any, ...]
+    got: np.ndarray | None = None
+    expected: np.ndarray | None = None
+    index: tuple[int, ...] | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,7 +52,7 @@ class Result:
     worst: Worst
     compared: int
     message: str = ""
-    call: Call | None = None
+    call: FailedCall | None = None
     extreme: bool = False
 
 
@@ -89,40 +112,66 @@ def not_implemented(check: Check, function: str, reason: str) -> Result:
     return Result(check, "not offered", Worst(), 0, f"{NOT_IMPLEMENTED}{function}" + (f" ({reason})" if reason else ""))
 
 
-def run_check(
-    check: Check, adapter: object, dtype: str, profile: str, seed: int = 0, examples: int = 25, shrink: bool = True
-) -> Result:
-    """Runs one check; what the candidate raises becomes a result."""
+def run_check(check: Check, adapter: object, setting: Setting, shrink: bool = True, ordinary: bool = False) -> Result:
+    """Runs one check; what the candidate raises becomes a result.
+
+    shrink: makes values smaller that deviate, which takes longer. ordinary: deviations with extreme input do not count.
+    """
     if lacking := missing(adapter, check):
         return not_offered(check, lacking)
-    return finish(check, Run(adapter, dtype, profile, seed, examples, shrink))
+    comparisons = Comparisons(setting.dtype)
+    ask = standing_in(asking(adapter), NumpyAdapter()) if ordinary and check.script else asking(adapter)
+    return outcome(check, adapter, comparisons, lambda: run(check, setting, ask, comparisons, adapter, shrink, ordinary))
 
 
-def finish(check: Check, run: Run) -> Result:
-    """Runs a check to its end or to its first deviation."""
-    try:
-        with ordinary_numbers(run.stand_in is not None):
-            check.body(run)
-    except Deviation as deviation:
-        return Result(check, "fail", run.worst, run.compared, str(deviation), run.last_call)
-    except CandidateLost as lost:
-        return Result(check, "error", Worst(math.inf, math.inf, check.name), run.compared, str(lost), run.last_call)
-    except (Exception, SystemExit) as error:  # an object that the candidate made may call sys.exit
-        if isinstance(error, NotImplementedError) and getattr(
-            run.adapter, "refuses_anyhow", False
-        ):  # not of our own columns
-            return not_implemented(check, run.last_call.function if run.last_call else check.name, str(error))
-        return Result(
-            check,
-            "error",
-            Worst(math.inf, math.inf, check.name),
-            run.compared,
-            traceback.format_exc(limit=-4),
-            run.last_call,
+def run(
+    check: Check,
+    setting: Setting,
+    ask: Ask,
+    comparisons: Comparisons,
+    adapter: object,
+    shrink: bool = True,
+    ordinary: bool = False,
+) -> None:
+    """Runs a check to its end or to its first deviation, which is raised. adapter: the candidate that `ask` asks."""
+    any_error = bool(getattr(adapter, "refuses_anyhow", False))
+    if check.cases is not None:
+        judge_cases(
+            check.cases, setting, ask, comparisons, ordinary=ordinary, shrink=shrink, any_error=any_error
         )
-    if not run.compared:
-        return Result(check, "error", run.worst, 0, "the check compared nothing")
-    return Result(check, "pass", run.worst, run.compared)
+    else:
+        assert check.script is not None
+        with ordinary_numbers(ordinary):
+            check.script(Script(setting, ask, comparisons, shrink, any_error, refusals=not ordinary))
+
+
+def outcome(check: Check, adapter: object, comparisons: Comparisons, body: Callable[[], None]) -> Result:
+    """What came of running a check."""
+
+    def result(status: str, worst: Worst, message: str, deviation: Deviation | None = None) -> Result:
+        return Result(check, status, worst, comparisons.compared, message, _failed(comparisons.call, deviation))
+
+    broken = Worst(math.inf, math.inf, check.name)
+    try:
+        body()
+    except Deviation as deviation:
+        return result("fail", comparisons.worst, str(deviation), deviation)
+    except CandidateLost as lost:
+        return result("error", broken, str(lost))
+    except (Exception, SystemExit) as error:  # an object that the candidate made may call sys.exit
+        if isinstance(error, NotImplementedError) and getattr(adapter, "refuses_anyhow", False):  # not of our own columns
+            return not_implemented(check, comparisons.call.function if comparisons.call else check.name, str(error))
+        return result("error", broken, traceback.format_exc(limit=-4))
+    if not comparisons.compared:
+        return Result(check, "error", comparisons.worst, 0, "the check compared nothing")
+    return Result(check, "pass", comparisons.worst, comparisons.compared)
+
+
+def _failed(call: Call | None, deviation: Deviation | None) -> FailedCall | None:
+    if call is None:
+        return None
+    arrays = (deviation.got, deviation.expected, deviation.index) if deviation is not None else (None, None, None)
+    return FailedCall(call.function, call.arguments, *arrays)
 
 
 def selected_checks(dtype: str, only: str = "") -> list[Check]:
@@ -137,11 +186,9 @@ def selected_checks(dtype: str, only: str = "") -> list[Check]:
     ]
 
 
-def run_checks(
-    adapter: object, dtype: str, profile: str, seed: int = 0, examples: int = 25, only: str = ""
-) -> Iterable[Result]:
-    for check in selected_checks(dtype, only):
-        yield run_check(check, adapter, dtype, profile, seed, examples)
+def run_checks(adapter: object, setting: Setting, only: str = "") -> Iterable[Result]:
+    for check in selected_checks(setting.dtype, only):
+        yield run_check(check, adapter, setting)
 
 
 def rows(results: Iterable[Result]) -> list[Row]:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from conformance.check import round_to
+from conformance.compare import round_to
 from reference_numpy import agent
 from spec import Config, Discrete, Image, Spaces, Vector, load_config, parameter_table
 

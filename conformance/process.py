@@ -21,7 +21,7 @@ import time
 from collections.abc import Mapping
 from typing import IO, Any
 
-from conformance.check import CandidateLost
+from conformance.compare import CandidateLost
 from conformance.errors import UserError
 from conformance.foreign import ForeignAdapter, as_edition
 from conformance.serve import PROTOCOL, BadMessage, decode, encode, to_numpy

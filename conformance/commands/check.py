@@ -8,7 +8,8 @@ from rich.console import Console
 
 from conformance.adapter import COLUMNS
 from conformance.candidate import candidate, remarks
-from conformance.check import DTYPES, Check
+from conformance.check import Check
+from conformance.compare import DTYPES
 from conformance.diagnosis import diagnose
 from conformance.editions import Fit, best, by_comparison, fit, judge_twice, telling_checks, to_json
 from conformance.errors import UserError

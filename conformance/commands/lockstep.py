@@ -11,7 +11,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from conformance.candidate import load_candidate
-from conformance.check import DTYPES
+from conformance.compare import DTYPES
 from conformance.errors import UserError
 from conformance.lockstep.bounds import bound
 from conformance.lockstep.drift import GROUPS

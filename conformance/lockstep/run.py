@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from conformance.check import round_to
+from conformance.compare import round_to
 from conformance.errors import UserError
 from conformance.lockstep.bounds import bound
 from conformance.lockstep.drift import GROUPS, Nested, Tensor, deviations
