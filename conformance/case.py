@@ -84,7 +84,9 @@ class Equal:
         try:
             actual = part_of(results[self.call], self.at)
         except (LookupError, TypeError):
-            comparisons.fail(where, f"{where}: the result has no part {list(self.at)}, it is {results[self.call]!r:.80}")
+            comparisons.fail(
+                where, f"{where}: the result has no part {list(self.at)}, it is {results[self.call]!r:.80}"
+            )
             return
         how = {"magnitude": self.magnitude, "factor": self.factor, "bound": self.bound}
         comparisons.compare(where, actual, self.expected, **how)
@@ -165,7 +167,9 @@ def exactly(expected: Any, at: Path = (), where: str = "", call: int = 0) -> Equ
     return Equal(expected, at, call, where, magnitude=1.0, bound=0.0)
 
 
-def judged(function: str, arguments: tuple[Any, ...], *demands: Equal | Callable[..., None], keeps: bool = False) -> Case:
+def judged(
+    function: str, arguments: tuple[Any, ...], *demands: Equal | Callable[..., None], keeps: bool = False
+) -> Case:
     """One call with several demands; a function takes the comparisons and the result."""
     return Case((Call(function, arguments),), _demands(demands), keeps=keeps)
 

@@ -9,14 +9,19 @@ deviation.
 
 import copy
 import dataclasses
-from collections.abc import Iterable, Mapping
+import functools
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
 
+from conformance.adapter import OBJECTS
 from conformance.adapters.numpy_adapter import NumpyAdapter
-from conformance.check import CHECKS, Check, Deviation, Run
-from conformance.execute import Result, finish, missing
+from conformance.case import Call, Equal, Refused, Setting
+from conformance.check import CHECKS, Check
+from conformance.compare import Comparisons, Unjudged
+from conformance.execute import FAILING, Result, missing, outcome, run
+from conformance.judge import Ask, asking, standing_in
 from conformance.mutants import MUTANTS, Mutant, MutantAdapter
 from conformance.mutants.trial import on_the_mutant, on_the_reference
 
@@ -27,7 +32,8 @@ DERIVATIVES = {"float64": 1e-5, "float32": 1e-2, "bfloat16": 0.1}  # those of th
 TRACE_LENGTH = 5000
 # so many checks, the most elementary first, are compared with every mutant in vain before the rest is left unexplained
 TRIES = 8
-VALUES = "agent.losses_match"
+VALUES = ("agent.losses_match",)
+"""The checks of all losses."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,9 +65,7 @@ class Diagnosis:
         }
 
 
-def diagnose(
-    adapter: object, results: Iterable[Result], dtype: str, profile: str, seed: int = 0, examples: int = 25
-) -> list[Diagnosis]:
+def diagnose(adapter: object, results: Iterable[Result], setting: Setting) -> list[Diagnosis]:
     """The mistakes that explain why checks fail, those that explain most first; each explains a check that none before
     it does.
 
@@ -70,9 +74,7 @@ def diagnose(
       results: of all checks that were run on it, with the settings that follow.
     """
     results = list(results)
-    candidate = _Candidate(
-        adapter, (dtype, profile, seed, examples), {result.check.name: result.status for result in results}
-    )
+    candidate = _Candidate(adapter, setting, {result.check.name: result.status for result in results})
     failing = [result.check for result in results if result.status in ("fail", "error")]
     failing.sort(key=lambda check: (check.level, _of_derivatives(check), candidate.size(check), check.name))
     traces = {check: trace for check in failing if (trace := candidate.trace(check))}
@@ -122,204 +124,191 @@ def _best(candidate: "_Candidate", explained: dict[Mutant, set[Check]], passing:
 
 
 @dataclasses.dataclass
-class _Call:
-    """One call and what came of it: a result, or the name of an exception's class. how: what the check allows."""
+class _Answer:
+    """What came of one call: a result, or the name of an exception's class. demand: what the check says of it."""
 
     function: str
+    demand: Equal | None = None
     result: Any = None
     raised: str | None = None
-    how: dict[str, Any] | None = None
 
 
 @dataclasses.dataclass
 class _Trace:
-    """The calls of a check. ordinary: with extreme input they are the reference's. to_the_end: also those after the
-    first deviation."""
+    """The answers to a check's calls.
+
+    ordinary: without extreme input. to_the_end: also those after the first deviation.
+    """
 
     ordinary: bool
     to_the_end: bool = False
-    calls: list[_Call] = dataclasses.field(default_factory=list)
+    answers: list[_Answer] = dataclasses.field(default_factory=list)
 
 
 class _Candidate:
-    """A candidate and what is known of it, for one dtype, profile, seed and number of examples."""
+    """A candidate and what is known of it, in one setting."""
 
-    def __init__(self, adapter: object, settings: tuple[str, str, int, int], statuses: dict[str, str]) -> None:
-        self.adapter, self.settings, self.statuses = adapter, settings, statuses
+    def __init__(self, adapter: object, setting: Setting, statuses: dict[str, str]) -> None:
+        self.adapter, self.setting, self.statuses = adapter, setting, statuses
         self._explained: dict[tuple[str, str], bool] = {}
         self._whole: dict[str, _Trace] = {}
 
     def size(self, check: Check) -> int:
         """How many numbers it compares."""
-        return on_the_reference(check, *self.settings)[0].compared
+        return on_the_reference(check, self.setting)[0].compared
 
     def trace(self, check: Check) -> _Trace | None:
-        """The calls of a check. None if the reference cannot make them, or makes them with the same results.
+        """The answers to a check. None if the reference cannot give them, or gives the same.
 
         Derivatives are compared where the losses are right: those of other losses are wrong anyway.
         """
-        if missing(NumpyAdapter(), check) or (
-            _of_derivatives(check) and self.statuses.get(VALUES) in ("fail", "error")
-        ):
+        if missing(NumpyAdapter(), check) or (_of_derivatives(check) and self._fails_values()):
             return None
         for ordinary in (True, False):
-            run = _Recorder(self.adapter, *self.settings, _Trace(ordinary))
-            finish(check, run)
-            if not self._follows(NumpyAdapter(), check, run.trace):
-                return run.trace
+            trace = self._answers(check, ordinary)
+            if not self._follows(NumpyAdapter(), check, trace):
+                return trace
         return None
 
     def explains(self, mutant: Mutant, check: Check, trace: _Trace) -> bool:
         key = (mutant.name, check.name)
         if key not in self._explained:
-            self._explained[key] = self._may_explain(mutant, check) and self._follows(
-                MutantAdapter(mutant), check, trace
-            )
+            follows = self._may_explain(mutant, check) and self._follows(MutantAdapter(mutant), check, trace)
+            self._explained[key] = follows
         return self._explained[key]
 
     def contradicts(self, mutant: Mutant, passing: list[Check]) -> bool:
         """Whether a check that the candidate passes fails on the mutant."""
         rows = {target.partition(".")[0] for target in mutant.edits}
-        return any(
-            self._fails(mutant, check)
-            for check in sorted(passing, key=lambda check: check.name.partition(".")[0] not in rows)
-        )
+        nearest = sorted(passing, key=lambda check: check.name.partition(".")[0] not in rows)
+        return any(self._fails(mutant, check) for check in nearest)
 
     def follows_to_the_end(self, mutant: Mutant, check: Check) -> bool:
         if check.name not in self._whole:
-            run = _Recorder(self.adapter, *self.settings, _Trace(ordinary=True, to_the_end=True))
-            finish(check, run)
-            self._whole[check.name] = run.trace
+            self._whole[check.name] = self._answers(check, ordinary=True, to_the_end=True)
         return self._follows(MutantAdapter(mutant), check, self._whole[check.name])
+
+    def _fails_values(self) -> bool:
+        return any(self.statuses.get(name) in FAILING for name in VALUES)
 
     def _may_explain(self, mutant: Mutant, check: Check) -> bool:
         """What changes a loss is not the mistake of a candidate whose losses are right. This is said fast, derivatives
         are slow."""
-        right = _of_derivatives(check) and self.statuses.get(VALUES) == "pass"
-        return self._reaches(mutant, check) and not (right and self._fails(mutant, CHECKS[VALUES]))
+        right = _of_derivatives(check) and all(self.statuses.get(name) == "pass" for name in VALUES)
+        return self._reaches(mutant, check) and not (
+            right and any(self._fails(mutant, CHECKS[name]) for name in VALUES)
+        )
 
     def _fails(self, mutant: Mutant, check: Check) -> bool:
-        return self._reaches(mutant, check) and on_the_mutant(mutant, check, *self.settings).status in ("fail", "error")
+        return self._reaches(mutant, check) and on_the_mutant(mutant, check, self.setting).status in FAILING
 
     def _reaches(self, mutant: Mutant, check: Check) -> bool:
-        return not on_the_reference(check, *self.settings)[1].isdisjoint(mutant.edits)
+        return not on_the_reference(check, self.setting)[1].isdisjoint(mutant.edits)
+
+    def _answers(self, check: Check, ordinary: bool, to_the_end: bool = False) -> _Trace:
+        trace = _Trace(ordinary, to_the_end)
+        self._run(check, self.adapter, trace, trace.answers.append)
+        return trace
 
     def _follows(self, adapter: object, check: Check, trace: _Trace) -> bool:
-        run = _Follower(adapter, *self.settings, trace)
-        finish(check, run)
-        return run.agrees
+        """Whether an adapter gives the answers of a trace. It is asked up to the first that differs."""
+        count = 0
 
+        def compare(answer: _Answer) -> None:
+            nonlocal count
+            if count < len(trace.answers) and not _same(answer, trace.answers[count], self.setting):
+                raise _Differs
+            count += 1
 
-class _Recorder(Run):
-    """A run that notes every call, those of objects that the candidate makes included."""
-
-    def __init__(self, adapter: object, dtype: str, profile: str, seed: int, examples: int, trace: _Trace) -> None:
-        super().__init__(
-            adapter, dtype, profile, seed, examples, shrink=False, stand_in=NumpyAdapter() if trace.ordinary else None
-        )
-        self.trace = trace
-
-    @property
-    def calls(self) -> list[_Call]:
-        return self.trace.calls
-
-    def call(self, function: str, *args: Any) -> Any:
-        made = self.noted(function, getattr(self.answering(function, args), function), *args)
-        return _Object(self, made) if isinstance(getattr(NumpyAdapter(), function, None), type) else made
-
-    def expect(self, function: str, args: tuple[Any, ...], expected: Any, **how: Any) -> Any:
-        before = len(self.calls)
-        actual = self.call(function, *args)
-        if len(self.calls) > before:
-            self.calls[-1].how = how
-        self.compare(function, actual, expected, **how)
-        return actual
-
-    def compare(self, where: str, actual: Any, expected: Any, **how: Any) -> None:
-        if not self.trace.to_the_end:
-            super().compare(where, actual, expected, **how)
-
-    def exact(self, where: str, actual: Any, expected: Any) -> None:
-        if not self.trace.to_the_end:
-            super().exact(where, actual, expected)
-
-    def holds(self, where: str, condition: Any) -> None:
-        if not self.trace.to_the_end:
-            super().holds(where, condition)
-
-    def noted(self, name: str, function: Any, *args: Any, **options: Any) -> Any:
-        entry = _Call(name)
         try:
-            result = function(*args, **options)
-        except Exception as error:
-            entry.raised = type(error).__name__
-            raise
-        else:
-            entry.result = copy.deepcopy(result) if _is_data(result) else None
-        finally:
-            self.note(entry)
-        return result
-
-    def note(self, entry: _Call) -> None:
-        if len(self.calls) < TRACE_LENGTH:
-            self.calls.append(entry)
-
-
-class _Follower(_Recorder):
-    """A run that compares every call with the same call of a trace, and ends at the first that differs."""
-
-    def __init__(self, adapter: object, dtype: str, profile: str, seed: int, examples: int, followed: _Trace) -> None:
-        super().__init__(adapter, dtype, profile, seed, examples, _Trace(followed.ordinary, followed.to_the_end))
-        self.followed = followed.calls
-        self.differs = False
-
-    @property
-    def agrees(self) -> bool:
-        return not self.differs and len(self.calls) >= min(len(self.followed), TRACE_LENGTH)
-
-    def note(self, entry: _Call) -> None:
-        super().note(entry)
-        position = len(self.calls) - 1
-        if not self.differs and position < len(self.followed):
-            self.differs = not self._same(entry, self.followed[position])
-        if self.differs:
-            raise Deviation("another result than in the trace")
-
-    def _same(self, entry: _Call, noted: _Call) -> bool:
-        if (entry.function, entry.raised) != (noted.function, noted.raised):
+            self._run(check, adapter, trace, compare)
+        except _Differs:
             return False
-        ruler = Run(None, self.dtype, self.profile)
-        bounds = DERIVATIVES if entry.function == "loss_derivatives" else AGREEMENT
-        try:
-            if noted.how is None:
-                return _agree(ruler, entry.result, noted.result, bounds[self.dtype])
-            # Both may err by what the check allows.
-            ruler.compare("", entry.result, noted.result, **{**noted.how, "factor": 2 * noted.how.get("factor", 1.0)})
-        except Exception:  # whatever a candidate may return where numbers are expected
-            return False
-        return True
+        return count >= len(trace.answers)
+
+    def _run(self, check: Check, adapter: object, how: _Trace, note: Callable[[_Answer], None]) -> None:
+        """Runs a check, and notes every answer."""
+        comparisons = (Unjudged if how.to_the_end else Comparisons)(self.setting.dtype)
+        ask = asking(adapter)
+        if how.ordinary and check.script:
+            ask = standing_in(ask, NumpyAdapter())
+        left = TRACE_LENGTH
+
+        def note_some(answer: _Answer) -> None:
+            nonlocal left
+            left -= 1
+            if left >= 0:
+                note(answer)
+
+        body = functools.partial(run, check, self.setting, _noting(ask, note_some), comparisons, adapter, False)
+        outcome(check, adapter, comparisons, lambda: body(how.ordinary))
+
+
+class _Differs(BaseException):
+    """Another answer than in the trace. Not an Exception: it is no failure of what is asked."""
+
+
+def _noting(ask: Ask, note: Callable[[_Answer], None]) -> Ask:
+    """Notes the answers, those of objects that are made included."""
+
+    def noted(call: Call, demand: Equal | Refused | None) -> Any:
+        answer = _Answer(call.function, demand if isinstance(demand, Equal) else None)
+        result = _noted(answer, note, lambda: ask(call, demand))
+        return _Object(result, note) if call.function in OBJECTS else result
+
+    return noted
+
+
+def _noted(answer: _Answer, note: Callable[[_Answer], None], call: Callable[[], Any]) -> Any:
+    try:
+        result = call()
+    except Exception as error:
+        answer.raised = type(error).__name__
+        raise
+    else:
+        answer.result = copy.deepcopy(result) if _is_data(result) else None
+    finally:
+        note(answer)
+    return result
 
 
 class _Object:
-    """Something with methods that the candidate made. Its calls are noted, too."""
+    """Something with methods that was made. Its answers are noted, too."""
 
-    def __init__(self, run: _Recorder, made: Any) -> None:
-        self._run, self._made = run, made
+    def __init__(self, made: Any, note: Callable[[_Answer], None]) -> None:
+        self._made, self._note = made, note
 
     def __getattr__(self, name: str) -> Any:
         method = getattr(self._made, name)
 
-        def call(*args: Any, **options: Any) -> Any:
-            return self._run.noted(name, method, *args, **options)
+        def call(*arguments: Any, **options: Any) -> Any:
+            return _noted(_Answer(name), self._note, lambda: method(*arguments, **options))
 
         call.__name__ = name
         return call
 
-    def __call__(self, *args: Any) -> Any:
-        return self._run.noted("__call__", self._made, *args)
+    def __call__(self, *arguments: Any) -> Any:
+        return _noted(_Answer("__call__"), self._note, lambda: self._made(*arguments))
 
     def __len__(self) -> int:
-        return int(self._run.noted("__len__", self._made.__len__))
+        return int(_noted(_Answer("__len__"), self._note, lambda: len(self._made)))
+
+
+def _same(answer: _Answer, noted: _Answer, setting: Setting) -> bool:
+    """Whether two answers agree."""
+    if (answer.function, answer.raised) != (noted.function, noted.raised):
+        return False
+    ruler, demand = Comparisons(setting.dtype), noted.demand
+    bound = (DERIVATIVES if answer.function == "loss_derivatives" else AGREEMENT)[setting.dtype]
+    try:
+        if demand is None or demand.bound == 0:
+            return _agree(ruler, answer.result, noted.result, bound)
+        # Both may err by what the check allows.
+        how = {"magnitude": demand.magnitude, "factor": 2 * demand.factor, "bound": demand.bound}
+        ruler.compare("", answer.result, noted.result, **how)
+    except Exception:  # whatever a candidate may return where numbers are expected
+        return False
+    return True
 
 
 def _of_derivatives(check: Check) -> bool:
@@ -335,7 +324,7 @@ def _is_data(result: Any) -> bool:
     return result is None or isinstance(result, str | bool | int | float | np.ndarray | np.generic)
 
 
-def _agree(ruler: Run, result: Any, noted: Any, bound: float) -> bool:
+def _agree(ruler: Comparisons, result: Any, noted: Any, bound: float) -> bool:
     """Whether a result has the numbers of the noted one within the bound, and is equal otherwise. The noted one may
     hold more keys."""
     if isinstance(result, Mapping):

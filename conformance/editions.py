@@ -9,17 +9,19 @@ not modelled, nothing is judged.
 
 import dataclasses
 import functools
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 
 from conformance.adapter import OBJECTS
 from conformance.adapters.numpy_adapter import NumpyAdapter
-from conformance.check import CHECKS, Check, Run, Worst, round_to
+from conformance.case import Call, Equal, Refused, Setting
+from conformance.check import CHECKS, Check
+from conformance.compare import WIDE, Comparisons, Unjudged, Worst, round_to
 from conformance.diagnosis import AGREEMENT, DERIVATIVES, VALUES
-from conformance.execute import FAILING, Result, Settings, finish, missing, not_offered
+from conformance.execute import FAILING, CheckOptions, Result, missing, not_offered, outcome, run, run_check
+from conformance.judge import Ask, asking, copied, judge_refusal, standing_in
 from conformance.mutants import MUTANTS, Mutant, MutantAdapter
 from conformance.mutants.trial import on_the_mutant, on_the_reference
 from spec import Edition, editions
@@ -81,15 +83,14 @@ def judge(
 
     ordinary: deviations with extreme input do not count.
     """
+    setting = Setting(dtype, edition.profile, seed, examples)
     if lacking := missing(adapter, check):
         return not_offered(check, lacking)
-    if reason := _unknown(check, edition.name, dtype, seed, examples):
+    if reason := _unknown(check, edition.name, setting):
         return Result(check, NOT_JUDGED, Worst(), 0, reason)
-    if _holds(check, edition.name, dtype, seed, examples):
-        return finish(
-            check, Run(adapter, dtype, edition.profile, seed, examples, shrink, NumpyAdapter() if ordinary else None)
-        )
-    return finish(check, _ComparedRun(adapter, edition, dtype, seed, examples, shrink, ordinary))
+    if _holds(check, edition.name, setting):
+        return run_check(check, adapter, setting, shrink, ordinary)
+    return _compared(check, adapter, edition, setting, shrink, ordinary)
 
 
 def judge_twice(
@@ -103,22 +104,22 @@ def judge_twice(
     return dataclasses.replace(result, extreme=again.status == "pass")
 
 
-def by_comparison(result: Result, edition: Edition, settings: Settings) -> bool:
+def by_comparison(result: Result, edition: Edition, asked: CheckOptions) -> bool:
     """Whether a check was compared with the edition's own reference, of which the catalogue of mutants says nothing."""
-    return not _holds(result.check, edition.name, settings.dtype, settings.seed, settings.examples)
+    return not _holds(result.check, edition.name, asked.setting)
 
 
 @functools.cache
-def _unknown(check: Check, name: str, dtype: str, seed: int, examples: int) -> str:
+def _unknown(check: Check, name: str, setting: Setting) -> str:
     """Why a check cannot be judged in an edition; "" if it can."""
     edition = editions()[name]
     if others := [identifier for identifier in check.requirements if _is_unknown(edition, identifier)]:
         return f"{name} has {', '.join(others)} otherwise, which is not modelled here"
     if own_reference(name) is None and edition.is_built:
         return ""
-    if reached := sorted(_reach(check, name, dtype, seed) & set(edition.beyond)):
+    if reached := sorted(_reach(check, setting) & set(edition.beyond)):
         return f"it reaches {', '.join(reached)}, which {name} has otherwise and which is not modelled here"
-    if _holds(check, name, dtype, seed, examples):
+    if _holds(check, name, setting):
         return ""
     if missing(NumpyAdapter(), check) or any(use in OBJECTS or use.startswith("draw_") for use in check.uses):
         return f"{name} has some of it otherwise, and there are no right results to compare with"
@@ -130,98 +131,76 @@ def _is_unknown(edition: Edition, requirement: str) -> bool:
 
 
 @functools.cache
-def _holds(check: Check, name: str, dtype: str, seed: int, examples: int) -> bool:
+def _holds(check: Check, name: str, setting: Setting) -> bool:
     """Whether a check is run as always: it names nothing that the edition has otherwise, and the edition's own
     reference passes it."""
     differs, mutant = editions()[name].differs, own_reference(name)
     if any(requirement in differs and differs[requirement].like for requirement in check.requirements):
         return False
-    if mutant is None or _reach(check, name, dtype, seed).isdisjoint(mutant.edits):
+    if mutant is None or _reach(check, setting).isdisjoint(mutant.edits):
         return True
-    check, dtype = _stand_in(check, dtype)
-    return on_the_mutant(mutant, check, dtype, editions()[name].profile, seed, examples).status == "pass"
+    return all(on_the_mutant(mutant, one, where).status == "pass" for one, where in _stand_ins(check, setting))
 
 
-def _reach(check: Check, name: str, dtype: str, seed: int) -> frozenset[str]:
-    check, dtype = _stand_in(check, dtype)
-    return on_the_reference(check, dtype, editions()[name].profile, seed, REACH_EXAMPLES)[1]
+def _reach(check: Check, setting: Setting) -> frozenset[str]:
+    one, where = _stand_ins(check, setting)[0]
+    return on_the_reference(one, dataclasses.replace(where, examples=REACH_EXAMPLES))[1]
 
 
-def _stand_in(check: Check, dtype: str) -> tuple[Check, str]:
+def _stand_ins(check: Check, setting: Setting) -> list[tuple[Check, Setting]]:
     """What can be asked of the reference: for gradients and train steps, which it lacks, the losses that these are made
     of."""
     if not missing(NumpyAdapter(), check):
-        return check, dtype
-    return CHECKS[VALUES], dtype if dtype in CHECKS[VALUES].dtypes else "float64"
+        return [(check, setting)]
+    values = [CHECKS[name] for name in VALUES]
+    wide = dataclasses.replace(setting, dtype="float64")
+    return [(value, setting if setting.dtype in value.dtypes else wide) for value in values]
 
 
-class _ComparedRun(Run):
-    """A check of whose calls every one is compared with the edition's reference. What the check itself expects does not
-    count."""
+def _compared(
+    check: Check, adapter: object, edition: Edition, setting: Setting, shrink: bool, ordinary: bool
+) -> Result:
+    """Runs a check of whose calls every one is compared with the edition's reference. What the check itself demands does
+    not count."""
+    mutant = own_reference(edition.name)
+    assert mutant is not None
+    comparisons = _Digits(setting.dtype)
+    ask = comparing(asking(adapter), asking(MutantAdapter(mutant)), comparisons, adapter)
+    if ordinary and check.script:
+        ask = standing_in(ask, MutantAdapter(mutant))
+    unjudged = Unjudged(setting.dtype)
+    body = functools.partial(run, check, setting, ask, unjudged, adapter, shrink, ordinary)
+    return outcome(check, adapter, comparisons, body)
 
-    def __init__(
-        self, adapter: object, edition: Edition, dtype: str, seed: int, examples: int, shrink: bool, ordinary: bool
-    ) -> None:
-        mutant = own_reference(edition.name)
-        assert mutant is not None
-        self._right = MutantAdapter(mutant)
-        super().__init__(adapter, dtype, edition.profile, seed, examples, shrink, self._right if ordinary else None)
-        self._counts = False
 
-    def call(self, function: str, *args: Any) -> Any:
-        if self._counts:
-            return super().call(function, *args)
-        expected = getattr(self._right, function)(*args)
-        with self._counting():
-            actual = self.call(function, *args)
-            self.compare(
-                function,
-                actual,
-                expected,
-                bound=(DERIVATIVES if function == "loss_derivatives" else AGREEMENT)[self.dtype],
-            )
+def comparing(theirs: Ask, right: Ask, comparisons: Comparisons, adapter: object) -> Ask:
+    """The candidate's answers, each compared with what is right."""
+
+    def ask(call: Call, demand: Equal | Refused | None) -> Any:
+        try:
+            expected = right(Call(call.function, copied(call.arguments, everything=True)), demand)
+        except ValueError:
+            if not isinstance(demand, Refused):
+                raise
+            any_error = bool(getattr(adapter, "refuses_anyhow", False))
+            judge_refusal(call, demand, theirs, comparisons, any_error)
+            return None
+        comparisons.call = Call(call.function, copied(call.arguments))
+        actual = theirs(call, demand)
+        bounds = DERIVATIVES if call.function == "loss_derivatives" else AGREEMENT
+        comparisons.compare(call.function, actual, expected, bound=bounds[comparisons.dtype])
         return actual
 
-    def expect(self, function: str, args: tuple[Any, ...], expected: Any, **how: Any) -> Any:
-        return self.call(function, *args)
+    return ask
 
-    def refuses(self, function: str, *args: Any, naming: Iterable[str] = ()) -> None:
-        try:
-            getattr(self._right, function)(*args)
-        except ValueError:
-            with self._counting():
-                super().refuses(function, *args, naming=naming)
-        else:
-            self.call(function, *args)
 
-    def compare(self, where: str, actual: Any, expected: Any, **how: Any) -> None:
-        if self._counts:
-            super().compare(where, actual, expected, **how)
+class _Digits(Comparisons):
+    """Digits far below 1 are demanded by the chapters. An edition may lose them, each program in its own way."""
 
-    def exact(self, where: str, actual: Any, expected: Any) -> None:
-        if self._counts:
-            super().exact(where, actual, expected)
-
-    def holds(self, where: str, condition: Any) -> None:
-        if self._counts:
-            super().holds(where, condition)
-
-    def _compare_arrays(self, where: str, actual: Any, expected: Any, magnitude: Any, bound: float) -> None:
-        expected = round_to(
-            expected, "float64" if self.dtype == "float64" else "float32"
-        )  # beyond which a right result is infinite
-        # Digits far below 1 are demanded by the chapters. An edition may lose them, each program in its own way.
-        super()._compare_arrays(
-            where, actual, expected, np.maximum(np.abs(expected), 1.0) if magnitude is None else magnitude, bound
-        )
-
-    @contextmanager
-    def _counting(self) -> Iterator[None]:
-        self._counts = True
-        try:
-            yield
-        finally:
-            self._counts = False
+    def compare_arrays(self, where: str, actual: Any, expected: Any, magnitude: Any, bound: float) -> None:
+        expected = round_to(expected, WIDE[self.dtype])  # beyond which a right result is infinite
+        size = np.maximum(np.abs(expected), 1.0) if magnitude is None else magnitude
+        super().compare_arrays(where, actual, expected, size, bound)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -252,12 +231,10 @@ def fit(checks: Iterable[Check], adapter: object, dtype: str, seed: int = 0, exa
             continue
         broken = False
         for name, statuses in found.items():
-            known = _unknown(check, name, dtype, seed, examples)
+            edition = editions()[name]
+            known = _unknown(check, name, Setting(dtype, edition.profile, seed, examples))
             status = NOT_JUDGED if known else "error" if broken else ""
-            status = (
-                status
-                or judge(check, adapter, editions()[name], dtype, seed, examples, shrink=False, ordinary=True).status
-            )
+            status = status or judge(check, adapter, edition, dtype, seed, examples, shrink=False, ordinary=True).status
             statuses[check.name] = NOT_JUDGED if status == "not offered" else status
             broken |= status == "error"
     return [Fit(name, statuses) for name, statuses in found.items()]

@@ -57,7 +57,7 @@ class Result:
 
 
 @dataclasses.dataclass(frozen=True)
-class Settings:
+class CheckOptions:
     """What a run was asked to do. candidate: its name, or the command of a process. at_least: how many checks must
     pass."""
 
@@ -72,9 +72,9 @@ class Settings:
     at_least: int
 
     @property
-    def profile(self) -> str:
-        """The name of the edition's values."""
-        return editions()[self.edition].profile
+    def setting(self) -> Setting:
+        """With the profile of the edition's values."""
+        return Setting(self.dtype, editions()[self.edition].profile, self.seed, self.examples)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,7 +121,9 @@ def run_check(check: Check, adapter: object, setting: Setting, shrink: bool = Tr
         return not_offered(check, lacking)
     comparisons = Comparisons(setting.dtype)
     ask = standing_in(asking(adapter), NumpyAdapter()) if ordinary and check.script else asking(adapter)
-    return outcome(check, adapter, comparisons, lambda: run(check, setting, ask, comparisons, adapter, shrink, ordinary))
+    return outcome(
+        check, adapter, comparisons, lambda: run(check, setting, ask, comparisons, adapter, shrink, ordinary)
+    )
 
 
 def run(
@@ -136,9 +138,7 @@ def run(
     """Runs a check to its end or to its first deviation, which is raised. adapter: the candidate that `ask` asks."""
     any_error = bool(getattr(adapter, "refuses_anyhow", False))
     if check.cases is not None:
-        judge_cases(
-            check.cases, setting, ask, comparisons, ordinary=ordinary, shrink=shrink, any_error=any_error
-        )
+        judge_cases(check.cases, setting, ask, comparisons, ordinary=ordinary, shrink=shrink, any_error=any_error)
     else:
         assert check.script is not None
         with ordinary_numbers(ordinary):
@@ -159,7 +159,9 @@ def outcome(check: Check, adapter: object, comparisons: Comparisons, body: Calla
     except CandidateLost as lost:
         return result("error", broken, str(lost))
     except (Exception, SystemExit) as error:  # an object that the candidate made may call sys.exit
-        if isinstance(error, NotImplementedError) and getattr(adapter, "refuses_anyhow", False):  # not of our own columns
+        if isinstance(error, NotImplementedError) and getattr(
+            adapter, "refuses_anyhow", False
+        ):  # not of our own columns
             return not_implemented(check, comparisons.call.function if comparisons.call else check.name, str(error))
         return result("error", broken, traceback.format_exc(limit=-4))
     if not comparisons.compared:

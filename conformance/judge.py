@@ -86,7 +86,9 @@ def judge_refusal(call: Call, demand: Refused, ask: Ask, comparisons: Comparison
             raise
         comparisons.holds(f"the error message of {function}", bool(str(error)))
         for word in demand.naming:
-            comparisons.holds(f"the error message of {function} names {word!r} ({_brief(str(error))})", word in str(error))
+            comparisons.holds(
+                f"the error message of {function} names {word!r} ({_brief(str(error))})", word in str(error)
+            )
         return
     what = f"{function} must raise a ValueError for {_brief(call.arguments)}, and returned {_brief(result)}"
     comparisons.fail(function, what)

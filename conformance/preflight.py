@@ -13,7 +13,9 @@ from typing import Any
 import numpy as np
 
 from conformance.adapter import load_adapter
-from conformance.check import Deviation, Run, Worst
+from conformance.case import Setting
+from conformance.compare import Comparisons, Deviation, Worst
+from conformance.judge import asking
 from conformance.problems import (
     Problem,
     random_batch,
@@ -23,6 +25,7 @@ from conformance.problems import (
     train_noise,
     with_sampling_margin,
 )
+from conformance.script import Script
 from reference_numpy import agent, networks, rssm
 from spec import Config, Spaces
 
@@ -88,29 +91,30 @@ def preflight_adapter(
 ) -> Report:
     """Compares any adapter with the reference. progress: see `preflight`."""
     small = dataclasses.replace(config, batch_size=ROWS, batch_length=STEPS, imagination_horizon=STEPS)
-    run = Run(adapter, config.compute_dtype, "", seed)
-    worst, comparisons = 0.0, []
+    comparisons = Comparisons(config.compute_dtype)
+    script = Script(Setting(config.compute_dtype, "", seed), asking(adapter), comparisons)
+    worst, agreed = 0.0, []
     parts = [("networks", compare_networks)]
     if config.compute_dtype in LOSS_BOUND:
         parts += [("losses and gradient", compare_losses)]
     for name, part in parts:
         try:
-            for what, function in part(run, spaces, small):
-                comparisons.append(
-                    Comparison(what, re.findall(r"\[([A-Z]+-\d+)\]", function.__doc__ or ""), run.worst.share)
+            for what, function in part(script, adapter, spaces, small):
+                agreed.append(
+                    Comparison(what, re.findall(r"\[([A-Z]+-\d+)\]", function.__doc__ or ""), comparisons.worst.share)
                 )
-                worst, run.worst = max(worst, run.worst.deviation), Worst()
+                worst, comparisons.worst = max(worst, comparisons.worst.deviation), Worst()
                 progress(what)
         except Deviation as deviation:
-            return Report(False, run.worst.deviation, f"{name}: {deviation}", comparisons)
+            return Report(False, comparisons.worst.deviation, f"{name}: {deviation}", agreed)
     names = ", ".join(name for name, _ in parts)
-    summary = f"{names} agree with the reference in {config.compute_dtype}, {run.compared:,} numbers compared"
-    return Report(True, worst, summary, comparisons)
+    summary = f"{names} agree with the reference in {config.compute_dtype}, {comparisons.compared:,} numbers compared"
+    return Report(True, worst, summary, agreed)
 
 
-def compare_networks(run: Run, spaces: Spaces, config: Config) -> Compared:
+def compare_networks(script: Script, adapter: object, spaces: Spaces, config: Config) -> Compared:
     """Encoder, one step of the recurrent model, prior, decoder and heads, each on given inputs."""
-    rng = np.random.default_rng(run.seed)
+    rng = np.random.default_rng(script.setting.seed)
     params = random_parameters(rng, config, spaces, "float32")
     observations = random_observations(rng, spaces, (ROWS,))
     carry = random_carry(rng, config, (ROWS,))
@@ -129,39 +133,45 @@ def compare_networks(run: Run, spaces: Spaces, config: Config) -> Compared:
     for head in (networks.reward_head, networks.continue_head, networks.critic):
         calls.append((head, (params, feature, config), head(params, feature, config)))
     for function, arguments, expected in calls:
-        run.expect(function.__name__, arguments, expected, magnitude="tensor", bound=NETWORK_BOUND[run.dtype])
+        script.expect(
+            function.__name__, arguments, expected, magnitude="tensor", bound=NETWORK_BOUND[script.setting.dtype]
+        )
         yield function.__name__, function
 
 
-def compare_losses(run: Run, spaces: Spaces, config: Config) -> Compared:
+def compare_losses(script: Script, adapter: object, spaces: Spaces, config: Config) -> Compared:
     """Every loss of a training step, and the derivative of the total along random directions, where the candidate has
     gradients."""
-    problem = comparable_problem(run, spaces, config)
+    problem = comparable_problem(script.setting.seed, spaces, config)
     total, aux = agent.losses(*problem.loss_arguments)
-    actual_total, actual = run.call("losses", *problem.loss_arguments)
+    actual_total, actual = script.call("losses", *problem.loss_arguments)
     size = max(1.0, *(abs(loss) for loss in aux["losses"].values()))
-    run.compare("losses", actual["losses"], aux["losses"], magnitude=size, bound=LOSS_BOUND[run.dtype])
+    script.compare("losses", actual["losses"], aux["losses"], magnitude=size, bound=LOSS_BOUND[script.setting.dtype])
     yield "losses", agent.losses
-    run.compare("total", actual_total, total, magnitude=max(size, abs(total)), bound=LOSS_BOUND[run.dtype])
+    script.compare(
+        "total", actual_total, total, magnitude=max(size, abs(total)), bound=LOSS_BOUND[script.setting.dtype]
+    )
     yield "total loss", agent.losses
 
-    if not callable(getattr(run.adapter, "gradients", None)):
+    if not callable(getattr(adapter, "gradients", None)):
         return  # the reference itself
-    gradients = run.call("gradients", *problem.loss_arguments)
+    gradients = script.call("gradients", *problem.loss_arguments)
     params, *others = problem.loss_arguments
     weights = np.array([getattr(config, f"{name.partition('/')[0]}_scale") for name in aux["losses"]])
 
     def losses(point: Any) -> np.ndarray:
         return np.array(list(agent.losses(point, *others)[1]["losses"].values()))
 
-    for label, direction in directions(params, run.seed):
+    for label, direction in directions(params, script.setting.seed):
         # Loss by loss, so that what a direction does not reach cancels without rounding.
         derivative = agent.directional_derivative(losses, params, direction, DIFFERENCE_STEP) @ weights
         product = sum(float((np.asarray(gradients[name]) * along).sum()) for name, along in direction.items())
         # The size of such a product on average: by chance a product can be nearly 0, and its error is not.
         usual = np.sqrt(sum(float((np.asarray(gradients[name]) ** 2).mean()) for name in direction))
         name = f"gradient along {label}"
-        run.compare(name, product, derivative, magnitude=max(usual, abs(derivative)), bound=GRADIENT_BOUND[run.dtype])
+        script.compare(
+            name, product, derivative, magnitude=max(usual, abs(derivative)), bound=GRADIENT_BOUND[script.setting.dtype]
+        )
         yield name, agent.directional_derivative
 
 
@@ -177,9 +187,9 @@ def directions(params: dict[str, np.ndarray], seed: int) -> Iterator[tuple[str, 
         yield label, {name: value / np.linalg.norm(value) for name, value in noise.items()}
 
 
-def comparable_problem(run: Run, spaces: Spaces, config: Config) -> Problem:
+def comparable_problem(seed: int, spaces: Spaces, config: Config) -> Problem:
     """A problem in which no sample lies so near a class boundary that honest rounding could move it across."""
-    rng = np.random.default_rng(run.seed)
+    rng = np.random.default_rng(seed)
     params = random_parameters(rng, config, spaces, "float32")
     state: dict[str, Any] = {
         "params": params,

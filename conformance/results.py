@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from conformance.errors import UserError, read_text
-from conformance.execute import FAILING, Result, Row, Settings, rows
+from conformance.execute import FAILING, CheckOptions, Result, Row, rows
 from conformance.expected import ExpectedFailures
 from conformance.foreign import ForeignAdapter
 from conformance.offered import offered, unchecked
@@ -49,7 +49,7 @@ def identity(adapter: object, candidate: str) -> Data:
 
 
 def result_data(
-    settings: Settings,
+    options: CheckOptions,
     implementation: Mapping[str, Any],
     results: Iterable[Result],
     expected: ExpectedFailures,
@@ -71,25 +71,25 @@ def result_data(
     return {
         "format": FORMAT,
         "date": time.strftime("%Y-%m-%d", time.gmtime()),
-        **dataclasses.asdict(settings),
-        "profile": settings.profile,
+        **dataclasses.asdict(options),
+        "profile": options.setting.profile,
         "choice": choice,
         "fit": fit,
         "implementation": dict(implementation),
         "unchecked": unchecked(implementation["offered"], results),
         "versions": versions(),
-        "verdict": verdict(settings, results, expected),
+        "verdict": verdict(options, results, expected),
         "expected_failures": [
             {"name": name, "reason": reason, "outcome": expected.outcome(name, results)}
             for name, reason in expected.reasons.items()
         ],
-        "checks": {result.check.name: _check(result, settings, expected) for result in results},
+        "checks": {result.check.name: _check(result, options, expected) for result in results},
         "requirements": {row.requirement: _requirement(row) for row in rows(results)},
         "diagnoses": [dict(diagnosis) for diagnosis in diagnoses],
     }
 
 
-def verdict(settings: Settings, results: Sequence[Result], expected: ExpectedFailures) -> Data:
+def verdict(options: CheckOptions, results: Sequence[Result], expected: ExpectedFailures) -> Data:
     """Whether the run passed, and what stands against it."""
     statuses = [
         result.status for result in results if expected.reason(result.check) is None or result.status not in FAILING
@@ -101,8 +101,8 @@ def verdict(settings: Settings, results: Sequence[Result], expected: ExpectedFai
         for name in expected.reasons
         if expected.outcome(name, results) == "pass"
     ]
-    if passing < settings.at_least:
-        problems.append(f"{_checks(passing)} passed, and at least {settings.at_least} must")
+    if passing < options.at_least:
+        problems.append(f"{_checks(passing)} passed, and at least {options.at_least} must")
     return {"passed": not problems, "problems": problems}
 
 
@@ -110,7 +110,7 @@ def _checks(count: int) -> str:
     return f"{count} {'check' if count == 1 else 'checks'}"
 
 
-def _check(result: Result, settings: Settings, expected: ExpectedFailures) -> Data:
+def _check(result: Result, options: CheckOptions, expected: ExpectedFailures) -> Data:
     check = result.check
     return {
         "status": result.status,
@@ -124,7 +124,7 @@ def _check(result: Result, settings: Settings, expected: ExpectedFailures) -> Da
         "message": result.message,
         "extreme": result.extreme,
         "expected_failure": expected.reason(check),
-        "failure": failure(result, settings) if result.status in FAILING else None,
+        "failure": failure(result, options) if result.status in FAILING else None,
     }
 
 

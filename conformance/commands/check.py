@@ -13,7 +13,7 @@ from conformance.compare import DTYPES
 from conformance.diagnosis import diagnose
 from conformance.editions import Fit, best, by_comparison, fit, judge_twice, telling_checks, to_json
 from conformance.errors import UserError
-from conformance.execute import FAILING, Result, Settings, selected_checks
+from conformance.execute import FAILING, CheckOptions, Result, selected_checks
 from conformance.expected import ExpectedFailures, read_expected
 from conformance.reports import badge, html, junit, markdown, terminal
 from conformance.results import Data, identity, result_data, write, write_text
@@ -80,30 +80,30 @@ def main(console: Console, options: argparse.Namespace) -> int:
         for remark in remarks(adapter):
             console.print(remark, markup=False, highlight=False)
         implementation = identity(adapter, options.candidate or options.process or "")
-        asked = options.edition or (COLUMN_EDITION if options.candidate in COLUMNS else None)
-        named = asked or _claimed(implementation["edition"])
+        given = options.edition or (COLUMN_EDITION if options.candidate in COLUMNS else None)
+        named = given or _claimed(implementation["edition"])
         fits = [] if named else _fit(console, checks, adapter, options)
-        settings = Settings(
+        asked = CheckOptions(
             candidate=options.candidate or options.process or "",
             process=options.process is not None,
             edition=named or best(fits).edition,
             **{name: getattr(options, name) for name in ("dtype", "device", "only", "seed", "examples", "at_least")},
         )
-        results = list(_run_all(console, checks, adapter, settings))
+        results = list(_run_all(console, checks, adapter, asked))
         if named and telling_checks(
             result.check for result in results if result.status in FAILING and not result.extreme
         ):
             fits = _fit(console, checks, adapter, options)
-        diagnoses = _diagnoses(console, adapter, results, settings)
-        choice = "given" if asked else "claimed" if named else "best fit"
+        diagnoses = _diagnoses(console, adapter, results, asked)
+        choice = "given" if given else "claimed" if named else "best fit"
         data = result_data(
-            settings,
+            asked,
             implementation,
             results,
             expected,
             diagnoses,
             choice,
-            to_json(fits, settings.edition) if fits else None,
+            to_json(fits, asked.edition) if fits else None,
         )
     terminal.show(console, data)
     if options.json:
@@ -127,20 +127,20 @@ def _fit(console: Console, checks: list[Check], adapter: object, options: argpar
         return fit(telling_checks(checks), adapter, options.dtype, options.seed)
 
 
-def _run_all(console: Console, checks: list[Check], adapter: object, settings: Settings) -> Iterable[Result]:
-    edition = editions()[settings.edition]
+def _run_all(console: Console, checks: list[Check], adapter: object, asked: CheckOptions) -> Iterable[Result]:
+    edition = editions()[asked.edition]
     with console.status("checking") as status:
         for number, check in enumerate(checks, 1):
             status.update(f"{number}/{len(checks)} {check.name}")
-            yield judge_twice(check, adapter, edition, settings.dtype, settings.seed, settings.examples)
+            yield judge_twice(check, adapter, edition, asked.dtype, asked.seed, asked.examples)
 
 
-def _diagnoses(console: Console, adapter: object, results: list[Result], settings: Settings) -> list[Data]:
+def _diagnoses(console: Console, adapter: object, results: list[Result], asked: CheckOptions) -> list[Data]:
     """The mistakes that explain failures. What the edition has otherwise is none."""
-    edition = editions()[settings.edition]
+    edition = editions()[asked.edition]
     results = [
-        result for result in results if result.status not in FAILING or not by_comparison(result, edition, settings)
+        result for result in results if result.status not in FAILING or not by_comparison(result, edition, asked)
     ]
     with console.status("comparing failures with known mistakes"):
-        found = diagnose(adapter, results, settings.dtype, settings.profile, settings.seed, settings.examples)
+        found = diagnose(adapter, results, asked.setting)
     return [diagnosis.to_json() for diagnosis in found if diagnosis.mutant.name not in edition.mutants]

@@ -8,11 +8,12 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from conformance.check import Worst
+from conformance.compare import Worst
 from conformance.diagnosis import Diagnosis, diagnose
 from conformance.errors import UserError
 from conformance.execute import Result, selected_checks
 from conformance.mutants import MUTANTS, Mutant, MutantAdapter, relevant, sound, trial
+from conformance.mutants.trial import setting_of_trials
 from conformance.results import versions, write
 
 EXAMPLES = 5
@@ -55,7 +56,7 @@ def main(console: Console, options: argparse.Namespace) -> int:
                 unmoved = [
                     Result(check, "pass", Worst(), 1) for check in reach if not reach[check] & mutant.edits.keys()
                 ]
-                found = diagnose(MutantAdapter(mutant), [*results, *unmoved], "float64", "paper", 0, EXAMPLES)
+                found = diagnose(MutantAdapter(mutant), [*results, *unmoved], setting_of_trials(EXAMPLES))
                 entry["diagnosis"] = [diagnosis_report(diagnosis) for diagnosis in found]
             view.add_row(*_row(mutant, entry))
     console.print(view)

@@ -8,6 +8,7 @@ from types import FrameType
 from typing import Any
 
 from conformance.adapters.numpy_adapter import NumpyAdapter
+from conformance.case import Setting
 from conformance.check import Check
 from conformance.execute import Result, run_check
 from conformance.mutants.catalogue import Mutant, MutantAdapter
@@ -51,11 +52,11 @@ class TracedReference:
 
 
 @functools.cache
-def on_the_reference(check: Check, dtype: str, profile: str, seed: int, examples: int) -> tuple[Result, frozenset[str]]:
+def on_the_reference(check: Check, setting: Setting) -> tuple[Result, frozenset[str]]:
     """What a check finds on the reference without a mistake, and which of its functions and classes the check
     reaches."""
     adapter = TracedReference()
-    result = run_check(check, adapter, dtype, profile, seed, examples, shrink=False)
+    result = run_check(check, adapter, setting, shrink=False)
     return result, frozenset(adapter.entered)
 
 
@@ -65,9 +66,13 @@ def sound(checks: Iterable[Check], examples: int = 5) -> tuple[dict[Check, froze
 
     A check that the reference does not pass would catch anything, so it says nothing about a mutant.
     """
-    found = [on_the_reference(check, "float64", "paper", 0, examples) for check in checks]
+    found = [on_the_reference(check, setting_of_trials(examples)) for check in checks]
     reach = {result.check: entered for result, entered in found if result.status == "pass"}
     return reach, [result for result, _ in found if result.status in ("fail", "error")]
+
+
+def setting_of_trials(examples: int) -> Setting:
+    return Setting("float64", "paper", 0, examples)
 
 
 def relevant(mutant: Mutant, reach: Reach) -> list[Check]:
@@ -81,12 +86,12 @@ def relevant(mutant: Mutant, reach: Reach) -> list[Check]:
 
 
 @functools.cache
-def on_the_mutant(mutant: Mutant, check: Check, dtype: str, profile: str, seed: int, examples: int) -> Result:
+def on_the_mutant(mutant: Mutant, check: Check, setting: Setting) -> Result:
     """What a check finds when the mutant is the candidate."""
-    return run_check(check, MutantAdapter(mutant), dtype, profile, seed, examples, shrink=False)
+    return run_check(check, MutantAdapter(mutant), setting, shrink=False)
 
 
 def trial(mutant: Mutant, checks: Iterable[Check], examples: int = 5) -> Iterator[Result]:
     """What the checks find when the mutant is the candidate, one after the other."""
     for check in checks:
-        yield on_the_mutant(mutant, check, "float64", "paper", 0, examples)
+        yield on_the_mutant(mutant, check, setting_of_trials(examples))

@@ -4,12 +4,11 @@ import shlex
 from typing import Any
 
 from conformance.adapter import COLUMNS, INTERFACE, OBJECTS
-from conformance.check import Call
-from conformance.execute import Result, Settings
+from conformance.execute import CheckOptions, FailedCall, Result
 from conformance.reports.values import WRITTEN_OUT, is_known, shown, size, source
 
 
-def failure(result: Result, settings: Settings) -> dict[str, Any]:
+def failure(result: Result, options: CheckOptions) -> dict[str, Any]:
     """The failing call in full as far as it is small, and how to repeat it; as the schema's `failure` says.
 
     The call is the last one before the deviation: it has the smallest arguments that hypothesis finds.
@@ -32,31 +31,31 @@ def failure(result: Result, settings: Settings) -> dict[str, Any]:
             )
     return {
         **found,
-        "command": command(result.check.name, settings),
-        "snippet": snippet(result.check.name, call, settings),
+        "command": command(result.check.name, options),
+        "snippet": snippet(result.check.name, call, options),
     }
 
 
-def command(name: str, settings: Settings) -> str:
+def command(name: str, options: CheckOptions) -> str:
     """The command line that runs this check alone, on the same cases."""
-    words = ["conformance", "check", *(["--process"] if settings.process else []), settings.candidate]
+    words = ["conformance", "check", *(["--process"] if options.process else []), options.candidate]
     words += [
         "--dtype",
-        settings.dtype,
-        *(["--device", settings.device] if settings.device else []),
+        options.dtype,
+        *(["--device", options.device] if options.device else []),
         "--edition",
-        settings.edition,
+        options.edition,
     ]
-    return shlex.join([*words, "--only", name, "--seed", str(settings.seed), "--examples", str(settings.examples)])
+    return shlex.join([*words, "--only", name, "--seed", str(options.seed), "--examples", str(options.examples)])
 
 
-def snippet(name: str, call: Call | None, settings: Settings) -> str:
+def snippet(name: str, call: FailedCall | None, options: CheckOptions) -> str:
     """Python that makes the failing call again.
 
     Arguments of up to WRITTEN_OUT numbers are written out. Larger ones are made anew by running the check; so is a call
     that makes an object, which fails in one of its methods.
     """
-    adapter = _adapter(settings)
+    adapter = _adapter(options)
     is_written = (
         call is not None
         and call.function not in OBJECTS
@@ -81,9 +80,7 @@ def snippet(name: str, call: Call | None, settings: Settings) -> str:
         ]
         lines += [f"{name} = {text}" for name, text in arguments]
         return "\n".join([*lines, f"print(adapter.{call.function}({', '.join(names)}))"])
-    options = (
-        f"find_edition({settings.edition!r}), {settings.dtype!r}, seed={settings.seed}, examples={settings.examples}"
-    )
+    how = f"find_edition({options.edition!r}), {options.dtype!r}, seed={options.seed}, examples={options.examples}"
     lines = [
         "import conformance.cases",
         adapter[0],
@@ -92,20 +89,20 @@ def snippet(name: str, call: Call | None, settings: Settings) -> str:
         "from spec import find_edition",
         "",
     ]
-    lines += [adapter[1], f"result = judge(CHECKS[{name!r}], adapter, {options})", "print(result.message)"]
+    lines += [adapter[1], f"result = judge(CHECKS[{name!r}], adapter, {how})", "print(result.message)"]
     if call is not None and call.function not in OBJECTS:
         lines += [f"print(adapter.{call.function}(*result.call.arguments))"]
         lines += ["print(result.call.expected)"] if call.expected is not None else []
     return "\n".join(lines)
 
 
-def _adapter(settings: Settings) -> tuple[str, str]:
+def _adapter(options: CheckOptions) -> tuple[str, str]:
     """Two lines: the import, and the adapter."""
-    if settings.process:
-        made = f"ProcessAdapter({settings.candidate!r}, {settings.dtype!r}, timeout=120)"
+    if options.process:
+        made = f"ProcessAdapter({options.candidate!r}, {options.dtype!r}, timeout=120)"
         return "from conformance.process import ProcessAdapter", f"adapter = {made}"
-    device = f", {settings.device!r}" if settings.device and settings.candidate in COLUMNS else ""
+    device = f", {options.device!r}" if options.device and options.candidate in COLUMNS else ""
     return (
         "from conformance.candidate import load_candidate",
-        f"adapter = load_candidate({settings.candidate!r}, {settings.dtype!r}{device})",
+        f"adapter = load_candidate({options.candidate!r}, {options.dtype!r}{device})",
     )

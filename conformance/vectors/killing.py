@@ -5,10 +5,10 @@ import numpy as np
 from conformance.adapters.numpy_adapter import NumpyAdapter
 from conformance.mutants import MUTANTS, MutantAdapter
 from conformance.mutants.trial import tracing
-from conformance.vectors.reading import Case, deviations
+from conformance.vectors.reading import StoredCase, deviations
 
 
-def kills(case: Case) -> list[str]:
+def kills(case: StoredCase) -> list[str]:
     """The names of the mutants that deviate from the case, or raise in it. Only those that change what the case calls
     are run."""
     entered: set[str] = set()
@@ -21,7 +21,7 @@ def kills(case: Case) -> list[str]:
     ]
 
 
-def _deviates(case: Case, adapter: object) -> bool:
+def _deviates(case: StoredCase, adapter: object) -> bool:
     try:
         with np.errstate(all="ignore"):
             return bool(deviations(case, adapter, "float64"))

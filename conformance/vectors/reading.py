@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from conformance.check import relative_deviation, scale_of
+from conformance.compare import relative_deviation, scale_of
 from conformance.errors import UserError, read_text
 from conformance.vectors.format import FORMAT, Table, read_npz
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Case:
+class StoredCase:
     """One case of a set, and the table that its arrays and objects stand in."""
 
     entry: Mapping[str, Any]
@@ -61,7 +61,7 @@ def read_index(directory: Path) -> dict[str, Any]:
     return index
 
 
-def read_cases(directory: Path) -> Iterator[Case]:
+def read_cases(directory: Path) -> Iterator[StoredCase]:
     """Every case of a set, in the order of its files."""
     index = read_index(directory)
     for name in index["files"]:
@@ -69,10 +69,10 @@ def read_cases(directory: Path) -> Iterator[Case]:
             content = json.loads((directory / name).read_text(encoding="utf-8"))
             table = Table(read_npz(directory / name.replace(".json", ".npz")), content["objects"])
             for entry in content["cases"]:
-                yield Case(entry, table, index["floor"])
+                yield StoredCase(entry, table, index["floor"])
 
 
-def deviations(case: Case, adapter: object, dtype: str) -> list[str]:
+def deviations(case: StoredCase, adapter: object, dtype: str) -> list[str]:
     """What an adapter does other than the case says; nothing where all is right."""
     function, arguments = getattr(adapter, case.entry["function"]), case.arguments(dtype)
     if refused := case.entry.get("refused"):
@@ -92,7 +92,7 @@ def deviations(case: Case, adapter: object, dtype: str) -> list[str]:
     return [message for message in found if message]
 
 
-def _deviation(case: Case, result: Mapping[str, Any], actual: Any, dtype: str) -> str:
+def _deviation(case: StoredCase, result: Mapping[str, Any], actual: Any, dtype: str) -> str:
     for key in result["at"]:
         actual = actual[key]
     actual, expected, scale = np.asarray(actual, np.float64), case.array(result["expected"]), result["scale"]

@@ -15,21 +15,18 @@ import hypothesis
 import numpy as np
 
 from conformance.adapter import INTERFACE
-from conformance.check import DTYPES, EPSILON, SMALLEST_NORMAL, Check
+from conformance.check import Check
+from conformance.compare import DTYPES, EPSILON, SMALLEST_NORMAL, WIDE
 from conformance.errors import UserError
 from conformance.execute import selected_checks
 from conformance.requirements import chapter_of
 from conformance.vectors.format import FORMAT, Table, shortest, to_json, to_npz
 from conformance.vectors.gradients import gradients
 from conformance.vectors.killing import kills
-from conformance.vectors.reading import Case
+from conformance.vectors.reading import StoredCase
 from conformance.vectors.recording import Output, Vector, along_one_direction, record
 
-FLOOR = {
-    dtype: SMALLEST_NORMAL[wide] / EPSILON[wide]
-    for dtype in DTYPES
-    for wide in ["float64" if dtype == "float64" else "float32"]
-}
+FLOOR = {dtype: SMALLEST_NORMAL[WIDE[dtype]] / EPSILON[WIDE[dtype]] for dtype in DTYPES}
 """The smallest scale of a tolerance: transforms, returns and losses are computed in float32 or better."""
 
 
@@ -177,7 +174,7 @@ def describe_case(vector: Vector, table: Table) -> dict[str, Any] | None:
             }
             for gradient in gradients(vector)
         ]
-    entry["kills"] = kills(Case(entry, table, FLOOR))
+    entry["kills"] = kills(StoredCase(entry, table, FLOOR))
     return entry
 
 
