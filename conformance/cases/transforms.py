@@ -3,102 +3,118 @@
 import hypothesis.strategies as st
 import numpy as np
 
-from conformance.check import Run, check, round_to
+from conformance.case import Cases, Drawn, Equal, Setting, equal, exact, judged, refused, related
+from conformance.check import check, script
+from conformance.compare import WIDE, Comparisons, round_to
+from conformance.script import Script
 from conformance.strategies import adversarial_numbers, arrays, normals, seeds, shapes
 from reference_numpy import transforms as reference
 
 SMALL_BINS = np.array([-3.0, -1.0, 0.0, 1.0, 3.0])
 
 
-def held_bins(run: Run, count: int = 255) -> np.ndarray:
+def held_bins(setting: Setting, count: int = 255) -> np.ndarray:
     """The bins as the candidate's precision holds them."""
-    return round_to(reference.exponential_bins(count), "float64" if run.dtype == "float64" else "float32")
+    return round_to(reference.exponential_bins(count), WIDE[setting.dtype])
+
+
+def is_odd(c: Comparisons, plus: np.ndarray, minus: np.ndarray) -> None:
+    c.exact("f(-x) + f(x)", minus, -np.asarray(plus))
 
 
 @check("TRA-3", uses=["symlog"], level=0)
-def symlog_literals(run: Run) -> None:
+def symlog_literals(setting: Setting) -> Cases:
     """symlog of 0, 1, -10, 100 and 1e30 is 0, ln 2, -ln 11, ln 101 and 69.0776."""
-    x = run.cast([0.0, -0.0, 1.0, -10.0, 100.0])
+    x = setting.cast([0.0, -0.0, 1.0, -10.0, 100.0])
     expected = np.array([0, 0, 0.6931471805599453, -2.3978952727983707, 4.61512051684126])
-    run.expect("symlog", (x,), expected, bound=16 * run.u)
+    yield equal("symlog", (x,), expected, bound=16 * setting.u)
 
 
 @check("TRA-2", "TRA-3", uses=["symlog"], level=0)
-def symlog_matches(run: Run) -> None:
+def symlog_matches(setting: Setting) -> Cases:
     """symlog agrees on zeros, subnormals, huge and non-finite numbers, in any shape."""
 
-    @run.for_all(x=shapes().flatmap(lambda shape: arrays(adversarial_numbers(), shape)))
-    def _(x: np.ndarray) -> None:
-        x = run.cast(x)
-        expected = reference.symlog(x)
-        actual = run.expect("symlog", (x,), expected, bound=16 * run.u)
-        run.exact("symlog(-x) + symlog(x)", run.call("symlog", -x), -np.asarray(actual))
+    def case(x: np.ndarray) -> Cases:
+        x = setting.cast(x)
+        yield equal("symlog", (x,), reference.symlog(x), bound=16 * setting.u)
+        yield related(is_odd, ("symlog", (x,)), ("symlog", (-x,)))
+
+    yield Drawn(case, x=shapes().flatmap(lambda shape: arrays(adversarial_numbers(), shape)))
 
 
 @check("TRA-4", uses=["symexp"], level=0)
-def symexp_literals(run: Run) -> None:
+def symexp_literals(setting: Setting) -> Cases:
     """symexp of 0, 1, -2 and 20 is 0, 1.718282, -6.389056 and 485165194.41."""
     expected = np.array([0.0, 0.0, 1.718281828459045, -6.38905609893065, 485165194.4097903])
-    run.expect("symexp", (run.cast([0.0, -0.0, 1.0, -2.0, 20.0]),), expected, bound=16 * 21 * run.u)
+    yield equal("symexp", (setting.cast([0.0, -0.0, 1.0, -2.0, 20.0]),), expected, bound=16 * 21 * setting.u)
 
 
 @check("TRA-2", "TRA-4", uses=["symexp"], level=0)
-def symexp_matches(run: Run) -> None:
+def symexp_matches(setting: Setting) -> Cases:
     """symexp agrees within 16 u (1 + |x|), overflows to infinity, and is odd."""
 
-    @run.for_all(x=shapes().flatmap(lambda shape: arrays(adversarial_numbers(), shape)))
-    def _(x: np.ndarray) -> None:
-        x = run.cast(x)
-        with np.errstate(over="ignore"):
-            expected = round_to(reference.symexp(x), "float64" if run.dtype == "float64" else "float32")
-        actual = np.asarray(run.call("symexp", x), np.float64)
-        near_overflow = np.abs(expected) > 2.0 ** (1022 if run.dtype == "float64" else 126)
-        expected = np.where(near_overflow & np.isinf(actual), np.copysign(np.inf, expected), expected)
-        run.compare("symexp", actual, expected, magnitude=np.abs(expected) * (1 + np.abs(x)), bound=16 * run.u)
-        run.exact("symexp(-x) + symexp(x)", run.call("symexp", -x), -actual)
+    def case(x: np.ndarray) -> Cases:
+        x = setting.cast(x)
+        expected = round_to(reference.symexp(x), WIDE[setting.dtype])
+        how = {"magnitude": np.abs(expected) * (1 + np.abs(x)), "bound": 16 * setting.u}
+        large = 2.0 ** (1022 if setting.dtype == "float64" else 126)
+        near_overflow = np.isfinite(expected) & (np.abs(expected) > large)
+
+        def matches_or_overflows(c: Comparisons, actual: np.ndarray) -> None:
+            either = np.where(near_overflow & np.isinf(actual), np.copysign(np.inf, expected), expected)
+            c.compare("symexp", actual, either, **how)
+
+        yield judged("symexp", (x,), matches_or_overflows if near_overflow.any() else Equal(expected, **how))
+        yield related(is_odd, ("symexp", (x,)), ("symexp", (-x,)))
+
+    yield Drawn(case, x=shapes().flatmap(lambda shape: arrays(adversarial_numbers(), shape)))
 
 
-@check("TRA-3", "TRA-4", uses=["symlog", "symexp"], level=0)
-def symexp_inverts_symlog(run: Run) -> None:
+@script("TRA-3", "TRA-4", uses=["symlog", "symexp"], level=0)
+def symexp_inverts_symlog(script: Script) -> None:
     """symexp(symlog(x)) is x."""
 
-    @run.for_all(x=arrays(st.floats(-1e6, 1e6, width=32), (8,)))
+    @script.for_all(x=arrays(st.floats(-1e6, 1e6, width=32), (8,)))
     def _(x: np.ndarray) -> None:
-        x = run.cast(x)
-        run.compare("symexp(symlog(x))", run.call("symexp", run.call("symlog", x)), x, bound=512 * run.u)
+        x = script.setting.cast(x)
+        actual = script.call("symexp", script.call("symlog", x))
+        script.compare("symexp(symlog(x))", actual, x, bound=512 * script.setting.u)
 
 
 @check("TRA-5", "TRA-6", uses=["exponential_bins"], level=0)
-def bins_literals(run: Run) -> None:
+def bins_literals(setting: Setting) -> Cases:
     """255 bins from -485165194.41 to 485165194.41, exactly antisymmetric, 0 in the middle; 5 bins in full."""
     five = [-485165194.4097903, -22025.465794806718, 0.0, 22025.465794806718, 485165194.4097903]
-    run.expect("exponential_bins", (5,), np.array(five), bound=1e-12)
-    bins = np.asarray(run.expect("exponential_bins", (255,), reference.exponential_bins(255), bound=1e-12))
-    run.compare(
-        "bins 127 to 129", bins[127:130], np.array([0.0, 0.17055771862604, 0.37020536395145]), magnitude=1.0, bound=1e-8
-    )
-    run.holds("bins are float64", bins.dtype == np.float64)
-    run.exact("bins are antisymmetric", bins[::-1], -bins)
-    run.holds("bins increase", np.diff(bins) > 0)
+    yield equal("exponential_bins", (5,), np.array(five), bound=1e-12)
+
+    def antisymmetric(c: Comparisons, bins: np.ndarray) -> None:
+        bins = np.asarray(bins)
+        inner = np.array([0.0, 0.17055771862604, 0.37020536395145])
+        c.compare("bins 127 to 129", bins[127:130], inner, magnitude=1.0, bound=1e-8)
+        c.holds("bins are float64", bins.dtype == np.float64)
+        c.exact("bins are antisymmetric", bins[::-1], -bins)
+        c.holds("bins increase", np.diff(bins) > 0)
+
+    yield judged("exponential_bins", (255,), Equal(reference.exponential_bins(255), bound=1e-12), antisymmetric)
 
 
 @check("TRA-6", uses=["exponential_bins"], level=0)
-def bins_refuse_even_counts(run: Run) -> None:
+def bins_refuse_even_counts(setting: Setting) -> Cases:
     """An even number of bins, or fewer than 3, is refused."""
     for count in (254, 2, 1, 0, -3):
-        run.refuses("exponential_bins", count)
+        yield refused("exponential_bins", count)
 
 
 @check("TRA-6", "TRA-7", "TRA-10", uses=["exponential_bins", "twohot", "ordered_expectation"], level=0)
-def the_fewest_bins(run: Run) -> None:
+def the_fewest_bins(setting: Setting) -> Cases:
     """There are 3 exponential bins at least, a two-hot encoding over 2 bins, and a mean over 3."""
-    run.expect("exponential_bins", (3,), np.array([-485165194.4097903, 0.0, 485165194.4097903]), bound=1e-12)
-    run.exact("twohot", run.call("twohot", np.array([0.0, -5.0]), np.array([-1.0, 3.0])), [[0.75, 0.25], [1, 0]])
-    run.exact("mean", run.call("ordered_expectation", np.array([0.25, 0.25, 0.5]), np.array([-2.0, 0.0, 2.0])), 0.5)
+    yield equal("exponential_bins", (3,), np.array([-485165194.4097903, 0.0, 485165194.4097903]), bound=1e-12)
+    yield exact("twohot", (np.array([0.0, -5.0]), np.array([-1.0, 3.0])), np.array([[0.75, 0.25], [1, 0]]))
+    yield exact("ordered_expectation", (np.array([0.25, 0.25, 0.5]), np.array([-2.0, 0.0, 2.0])), 0.5)
 
 
 @check("TRA-7", "TRA-8", uses=["twohot"], level=0)
-def twohot_literals(run: Run) -> None:
+def twohot_literals(setting: Setting) -> Cases:
     """Over the bins -3, -1, 0, 1, 3: 2 is [0,0,0,.5,.5], -.25 is [0,.25,.75,0,0], a bin is itself, 7 is the last
     bin."""
     x = np.array([2.0, -0.25, 1.0, 7.0, -3.0, -0.0, -9.0])
@@ -106,126 +122,116 @@ def twohot_literals(run: Run) -> None:
     expected[0, 3:] = 0.5
     expected[1, 1:3] = 0.25, 0.75
     expected[2, 3] = expected[3, 4] = expected[4, 0] = expected[5, 2] = expected[6, 0] = 1
-    run.exact("twohot", run.call("twohot", x, SMALL_BINS), expected)
+    yield exact("twohot", (x, SMALL_BINS), expected)
     weights = np.zeros((2, 255))
     weights[0, 127:129] = 0.4136882, 0.5863118
     weights[1, 163:165] = 0.774017, 0.225983
-    run.expect(
-        "twohot",
-        (run.cast([0.1, 300.0]), held_bins(run)),
-        weights,
-        magnitude=1.0,
-        bound=1e-5 if run.dtype != "bfloat16" else 1e-2,
-    )
+    bound = 1e-5 if setting.dtype != "bfloat16" else 1e-2
+    yield equal("twohot", (setting.cast([0.1, 300.0]), held_bins(setting)), weights, magnitude=1.0, bound=bound)
 
 
 @check("TRA-7", "TRA-8", "TRA-9", "TRA-14", uses=["twohot"], level=0)
-def twohot_matches(run: Run) -> None:
+def twohot_matches(setting: Setting) -> Cases:
     """Weights agree on bin edges and their neighbours, huge and non-finite numbers; other entries are exactly 0; the
     sum is 1."""
-    bins = held_bins(run)
+    bins = held_bins(setting)
     edges = st.integers(0, 254).flatmap(
         lambda k: st.sampled_from([bins[k], np.nextafter(bins[k], -np.inf), np.nextafter(bins[k], np.inf)])
     )
 
-    @run.for_all(x=shapes().flatmap(lambda shape: arrays(st.one_of(adversarial_numbers(), edges), shape)))
-    def _(x: np.ndarray) -> None:
-        x = run.cast(x)
-        expected = reference.twohot(x, bins)
-        actual = np.asarray(run.call("twohot", x, bins), np.float64)
+    def case(x: np.ndarray) -> Cases:
+        x = setting.cast(x)
+
+        def two_weights(c: Comparisons, actual: np.ndarray) -> None:
+            finite = np.asarray(actual, np.float64)[~np.isnan(x)]
+            c.holds("at most two weights are not 0", (finite != 0).sum(-1) <= 2)
+            c.holds("weights lie in [0, 1]", (finite >= 0) & (finite <= 1))
+            ones = np.ones(finite.shape[:-1])
+            c.compare("sum of weights", finite.sum(-1), ones, magnitude=1.0, bound=4 * setting.u)
+            c.holds("a bin has weight 1 on itself", finite[np.isin(x[~np.isnan(x)], bins)].max(-1, initial=1.0) == 1)
+
         # Subnormal numbers may be flushed, and weights of the order of a rounding error may be 0.
-        run.compare("twohot", actual, expected, magnitude=1.0, bound=64 * run.u)
-        finite = actual[~np.isnan(x)]
-        run.holds("at most two weights are not 0", (finite != 0).sum(-1) <= 2)
-        run.holds("weights lie in [0, 1]", (finite >= 0) & (finite <= 1))
-        run.compare("sum of weights", finite.sum(-1), np.ones(finite.shape[:-1]), magnitude=1.0, bound=4 * run.u)
-        run.holds("a bin has weight 1 on itself", finite[np.isin(x[~np.isnan(x)], bins)].max(-1, initial=1.0) == 1)
+        expected = Equal(reference.twohot(x, bins), magnitude=1.0, bound=64 * setting.u)
+        yield judged("twohot", (x, bins), expected, two_weights)
+
+    yield Drawn(case, x=shapes().flatmap(lambda shape: arrays(st.one_of(adversarial_numbers(), edges), shape)))
 
 
 @check("TRA-7", uses=["twohot"], level=0)
-def twohot_mean_is_the_number(run: Run) -> None:
+def twohot_mean_is_the_number(setting: Setting) -> Cases:
     """The mean of the weights is the number itself, interpolated between the raw bins and not between their symlogs."""
-    bins = held_bins(run)
-    x = run.cast(np.linspace(-50, 50, 41))
-    mean = np.asarray(run.call("twohot", x, bins), np.float64) @ bins
-    run.compare("mean of twohot(x)", mean, x, magnitude=1 + np.abs(x), bound=64 * run.u)
+    bins = held_bins(setting)
+    x = setting.cast(np.linspace(-50, 50, 41))
+
+    def mean_is_x(c: Comparisons, weights: np.ndarray) -> None:
+        mean = np.asarray(weights, np.float64) @ bins
+        c.compare("mean of twohot(x)", mean, x, magnitude=1 + np.abs(x), bound=64 * setting.u)
+
+    yield judged("twohot", (x, bins), mean_is_x)
 
 
 @check("TRA-10", "TRA-14", uses=["ordered_expectation"], level=0)
-def expectation_matches(run: Run) -> None:
+def expectation_matches(setting: Setting) -> Cases:
     """The mean over bins that span 17 orders of magnitude, within rounding of the paired sum."""
-    literal = run.call("ordered_expectation", np.array([0.125, 0.1875, 0.3125, 0.125, 0.25]), SMALL_BINS)
-    run.exact("ordered_expectation of [2, 3, 5, 2, 4] / 16", literal, 0.3125)
+    sixteenths = np.array([0.125, 0.1875, 0.3125, 0.125, 0.25])
+    yield exact("ordered_expectation", (sixteenths, SMALL_BINS), 0.3125, where="mean with [2, 3, 5, 2, 4] / 16")
+    bins = held_bins(setting)
 
-    @run.for_all(seed=seeds(), shape=shapes(2), scale=st.sampled_from([1e-3, 1.0, 30.0]))
-    def _(seed: int, shape: tuple[int, ...], scale: float) -> None:
-        bins = held_bins(run)
+    def case(seed: int, shape: tuple[int, ...], scale: float) -> Cases:
         logits = normals(seed, *shape, 255, scale=scale)
-        probs = run.cast(
-            np.exp(logits - logits.max(-1, keepdims=True))
-            / np.exp(logits - logits.max(-1, keepdims=True)).sum(-1, keepdims=True)
-        )
-        magnitude = (bins[128:] * np.abs(probs[..., 128:] - probs[..., 126::-1])).sum(-1) + run.tiny
-        run.expect(
-            "ordered_expectation",
-            (probs, bins),
-            reference.ordered_expectation(probs, bins),
-            magnitude=magnitude,
-            bound=64 * run.u,
-        )
+        odds = np.exp(logits - logits.max(-1, keepdims=True))
+        probs = setting.cast(odds / odds.sum(-1, keepdims=True))
+        magnitude = (bins[128:] * np.abs(probs[..., 128:] - probs[..., 126::-1])).sum(-1) + setting.tiny
+        expected = reference.ordered_expectation(probs, bins)
+        yield equal("ordered_expectation", (probs, bins), expected, magnitude=magnitude, bound=64 * setting.u)
+
+    yield Drawn(case, seed=seeds(), shape=shapes(2), scale=st.sampled_from([1e-3, 1.0, 30.0]))
 
 
 @check("TRA-11", uses=["ordered_expectation"], level=0)
-def expectation_is_exactly_antisymmetric(run: Run) -> None:
+def expectation_is_exactly_antisymmetric(setting: Setting) -> Cases:
     """Mirror-symmetric probabilities give exactly 0, and mirroring the probabilities exactly changes the sign."""
-    run.exact(
-        "uniform probabilities",
-        run.call("ordered_expectation", run.cast(np.full((3, 255), 1 / 255)), held_bins(run)),
-        np.zeros(3),
-    )
+    bins, uniform = held_bins(setting), setting.cast(np.full((3, 255), 1 / 255))
+    yield exact("ordered_expectation", (uniform, bins), np.zeros(3), where="uniform probabilities")
 
-    @run.for_all(seed=seeds())
-    def _(seed: int) -> None:
-        probs = run.cast(np.random.default_rng(seed).dirichlet(np.full(255, 0.5), 3))
-        mean = np.asarray(run.call("ordered_expectation", probs, held_bins(run)))
-        run.exact("mirrored", run.call("ordered_expectation", probs[:, ::-1].copy(), held_bins(run)), -mean)
-        symmetric = run.cast((probs + probs[:, ::-1]) / 2)
+    def mirrored(c: Comparisons, mean: np.ndarray, other: np.ndarray) -> None:
+        c.exact("mirrored", other, -np.asarray(mean))
+
+    def case(seed: int) -> Cases:
+        probs = setting.cast(np.random.default_rng(seed).dirichlet(np.full(255, 0.5), 3))
+        reverse = probs[:, ::-1].copy()
+        yield related(mirrored, ("ordered_expectation", (probs, bins)), ("ordered_expectation", (reverse, bins)))
+        symmetric = setting.cast((probs + reverse) / 2)
         symmetric = np.concatenate([symmetric[:, :128], symmetric[:, 126::-1]], -1)
-        run.exact("symmetric", run.call("ordered_expectation", symmetric, held_bins(run)), np.zeros(3))
+        yield exact("ordered_expectation", (symmetric, bins), np.zeros(3), where="symmetric")
+
+    yield Drawn(case, seed=seeds())
 
 
 @check("TRA-12", uses=["ordered_expectation"], level=0)
-def expectation_of_nan(run: Run) -> None:
+def expectation_of_nan(setting: Setting) -> Cases:
     """A NaN among the probabilities of one distribution makes its mean NaN, and no other."""
     probs = np.full((4, 255), 1 / 255)
     probs[1, 127] = probs[2, 0] = np.nan
-    actual = run.call("ordered_expectation", probs, held_bins(run))
-    run.exact("ordered_expectation", actual, np.array([0, np.nan, np.nan, 0]))
+    yield exact("ordered_expectation", (probs, held_bins(setting)), np.array([0, np.nan, np.nan, 0]))
 
 
 @check("TRA-13", uses=["twohot", "ordered_expectation"], level=0)
-def wrong_bins_are_refused(run: Run) -> None:
+def wrong_bins_are_refused(setting: Setting) -> Cases:
     """Bins that are not one row of enough entries, or that do not fit the probabilities, are refused."""
-    run.refuses("twohot", np.zeros(3), np.zeros((2, 5)))
-    run.refuses("twohot", np.zeros(3), np.zeros(1))
-    run.refuses("ordered_expectation", np.full((2, 4), 0.25), np.array([-3.0, -1.0, 1.0, 3.0]))
-    run.refuses("ordered_expectation", np.full((2, 5), 0.2), np.array([-1.0, 0.0, 1.0]))
-    run.refuses("ordered_expectation", np.full((2, 5), 0.2), np.zeros((1, 5)))
+    yield refused("twohot", np.zeros(3), np.zeros((2, 5)))
+    yield refused("twohot", np.zeros(3), np.zeros(1))
+    yield refused("ordered_expectation", np.full((2, 4), 0.25), np.array([-3.0, -1.0, 1.0, 3.0]))
+    yield refused("ordered_expectation", np.full((2, 5), 0.2), np.array([-1.0, 0.0, 1.0]))
+    yield refused("ordered_expectation", np.full((2, 5), 0.2), np.zeros((1, 5)))
 
 
 @check("TRA-1", uses=["symlog", "symexp", "twohot", "ordered_expectation"], level=0)
-def float32_or_better(run: Run) -> None:
+def float32_or_better(setting: Setting) -> Cases:
     """Whatever the compute dtype, results are more precise than bfloat16 could hold."""
-    x = run.cast([0.3, 0.7, 5.1])
-    run.expect("symlog", (x,), reference.symlog(x), bound=16 * run.u)
-    run.expect("symexp", (x,), reference.symexp(x), bound=16 * 7 * run.u)
-    run.expect("twohot", (x, SMALL_BINS), reference.twohot(x, SMALL_BINS), magnitude=1.0, bound=64 * run.u)
-    probs = np.array([0.1, 0.2, 0.3, 0.15, 0.25])
-    held = run.cast(probs)
-    run.expect(
-        "ordered_expectation",
-        (held, SMALL_BINS),
-        reference.ordered_expectation(held, SMALL_BINS),
-        magnitude=1.0,
-        bound=64 * run.u,
-    )
+    x, probs = setting.cast([0.3, 0.7, 5.1]), setting.cast([0.1, 0.2, 0.3, 0.15, 0.25])
+    weights, mean = reference.twohot(x, SMALL_BINS), reference.ordered_expectation(probs, SMALL_BINS)
+    yield equal("symlog", (x,), reference.symlog(x), bound=16 * setting.u)
+    yield equal("symexp", (x,), reference.symexp(x), bound=16 * 7 * setting.u)
+    yield equal("twohot", (x, SMALL_BINS), weights, magnitude=1.0, bound=64 * setting.u)
+    yield equal("ordered_expectation", (probs, SMALL_BINS), mean, magnitude=1.0, bound=64 * setting.u)
