@@ -7,7 +7,9 @@ from typing import Any
 import hypothesis.strategies as st
 import numpy as np
 
-from conformance.check import Run, check, round_to
+from conformance.case import Cases, Drawn, Equal, Setting, equal, exact, exactly, judged, refused, related
+from conformance.check import check
+from conformance.compare import Comparisons, round_to
 from conformance.problems import random_observations, random_parameters, small_config
 from conformance.strategies import adversarial_numbers, arrays, normals, seeds
 from reference_numpy import networks as reference
@@ -32,25 +34,25 @@ ROWS = 3
 LARGEST = 3.4028234663852886e38  # of float32; bfloat16 rounds it to infinity
 
 
-def config_of(run: Run, index: int | None = None, **overrides: Any) -> Config:
+def config_of(setting: Setting, index: int | None = None, **overrides: Any) -> Config:
     """A small configuration with the convolutions of that index; with None, of the kind that the profile has."""
-    index = own_convolutions(run)[0] if index is None else index
-    return small_config(run.profile, run.dtype, **{"blocks": 2, **CONVOLUTIONS[index], **overrides})
+    index = own_convolutions(setting)[0] if index is None else index
+    return small_config(setting.profile, setting.dtype, **{"blocks": 2, **CONVOLUTIONS[index], **overrides})
 
 
-def own_convolutions(run: Run) -> list[int]:
+def own_convolutions(setting: Setting) -> list[int]:
     """Which of CONVOLUTIONS is of the kind that the profile has. Code that has no other can be checked with it."""
-    plain = small_config(run.profile)
+    plain = small_config(setting.profile)
     kinds = [(kind["cnn_sampling"], kind["cnn_outer"]) for kind in CONVOLUTIONS]
     return [kinds.index((plain.cnn_sampling, plain.cnn_outer))]
 
 
-def other_convolutions(run: Run) -> list[int]:
-    return [index for index in range(len(CONVOLUTIONS)) if index not in own_convolutions(run)]
+def other_convolutions(setting: Setting) -> list[int]:
+    return [index for index in range(len(CONVOLUTIONS)) if index not in own_convolutions(setting)]
 
 
-def params_of(run: Run, config: Config, task: Spaces = TASK, seed: int = 0) -> dict[str, np.ndarray]:
-    return random_parameters(np.random.default_rng(run.seed + seed), config, task, run.dtype)
+def params_of(setting: Setting, config: Config, task: Spaces = TASK, seed: int = 0) -> dict[str, np.ndarray]:
+    return random_parameters(np.random.default_rng(setting.seed + seed), config, task, setting.dtype)
 
 
 def zero_parameters(config: Config, task: Spaces) -> dict[str, np.ndarray]:
@@ -66,8 +68,8 @@ def observations_of(seed: int, task: Spaces, leading: tuple[int, ...] = (ROWS,))
     return {key: drawn[key] for key in reversed(drawn)}
 
 
-def features_of(run: Run, config: Config, *leading: int, seed: int = 0) -> np.ndarray:
-    return run.cast(normals(run.seed + seed, *leading, config.feature_size))
+def features_of(setting: Setting, config: Config, *leading: int, seed: int = 0) -> np.ndarray:
+    return setting.cast(normals(setting.seed + seed, *leading, config.feature_size))
 
 
 def largest(result: Any) -> Any:
@@ -87,33 +89,27 @@ def activated(*values: float) -> np.ndarray:
 
 
 @check("NET-3", "NET-5", "CON-25", uses=["encoder"], level=1)
-def encoded_vector_literals(run: Run) -> None:
+def encoded_vector_literals(setting: Setting) -> Cases:
     """speed (0, e - 1) and item (2, 0) of Discrete((3, 2)) enter as (0, 0, 1, 1, 0, 0, 1): sorted keys, one-hots,
     symlog."""
     task = Spaces({"speed": Vector(2), "item": Discrete((3, 2))}, ACTIONS)
-    config = config_of(run, units=7, encoder_layers=1, norm_epsilon=0.0)
+    config = config_of(setting, units=7, encoder_layers=1, norm_epsilon=0.0)
     params = zero_parameters(config, task) | {"encoder/vector/hidden0/kernel": np.eye(7)}
     observations = {"speed": np.array([[0, math.e - 1]], np.float32), "item": np.array([[2, 0]])}
     expected = activated(0, 0, 1, 1, 0, 0, 1)[None]
-    run.expect(
-        "encoder",
-        (params, observations, task, config),
-        expected,
-        magnitude="tensor",
-        bound=1e-6 if run.u < 1e-10 else None,
-    )
+    bound = 1e-6 if setting.u < 1e-10 else None
+    yield equal("encoder", (params, observations, task, config), expected, magnitude="tensor", bound=bound)
 
 
 @check("NET-2", "NET-3", "NET-5", "NET-11", "NET-26", "CON-24", "CON-26", uses=["encoder"], level=1)
-def encoder_of_vectors_matches(run: Run) -> None:
+def encoder_of_vectors_matches(setting: Setting) -> Cases:
     """Tokens of vectors that hold zeros, subnormals and the largest float32, and of discrete entries; nothing else is
     read."""
-    config = config_of(run, encoder_layers=2)
+    config = config_of(setting, encoder_layers=2)
     numbers = st.one_of(adversarial_numbers(finite=True), st.sampled_from([LARGEST, -LARGEST]))
 
-    @run.for_all(seed=seeds(), position=arrays(numbers, (ROWS, 3)), speed=arrays(numbers, (ROWS, 2)))
-    def _(seed: int, position: np.ndarray, speed: np.ndarray) -> None:
-        params = params_of(run, config, VECTOR_TASK, seed)
+    def case(seed: int, position: np.ndarray, speed: np.ndarray) -> Cases:
+        params = params_of(setting, config, VECTOR_TASK, seed)
         vectors = {"position": position.astype(np.float32), "Speed": speed.astype(np.float32)}
         observations = observations_of(seed, VECTOR_TASK) | vectors
         expected = reference.encoder(params, observations, VECTOR_TASK, config)
@@ -122,224 +118,228 @@ def encoder_of_vectors_matches(run: Run) -> None:
             "is_first": np.ones(ROWS, bool),
             "prev_action": np.full((ROWS, 8), np.nan),
         }
-        run.expect("encoder", (params, other | observations, VECTOR_TASK, config), expected, magnitude="tensor")
+        yield equal("encoder", (params, other | observations, VECTOR_TASK, config), expected, magnitude="tensor")
+
+    yield Drawn(case, seed=seeds(), position=arrays(numbers, (ROWS, 3)), speed=arrays(numbers, (ROWS, 2)))
 
 
 @check("NET-4", uses=["encoder"], level=1)
-def integers_of_any_kind(run: Run) -> None:
+def integers_of_any_kind(setting: Setting) -> Cases:
     """A Discrete observation may have any integer dtype, and no other."""
-    config = config_of(run)
-    params, observations = params_of(run, config, VECTOR_TASK), observations_of(run.seed, VECTOR_TASK)
-    before = run.call("encoder", params, observations, VECTOR_TASK, config)
+    config = config_of(setting)
+    params, observations = params_of(setting, config, VECTOR_TASK), observations_of(setting.seed, VECTOR_TASK)
+    mode = observations["mode"]
     for dtype in (np.uint8, np.int32, np.int64):
-        mode = observations["mode"].astype(dtype)
-        run.exact(
-            f"tokens of {mode.dtype}",
-            run.call("encoder", params, observations | {"mode": mode}, VECTOR_TASK, config),
-            before,
-        )
+
+        def same(c: Comparisons, before: np.ndarray, after: np.ndarray, dtype: type = dtype) -> None:
+            c.exact(f"tokens of {np.dtype(dtype)}", after, before)
+
+        inputs = (observations, observations | {"mode": mode.astype(dtype)})
+        yield related(same, *(("encoder", (params, x, VECTOR_TASK, config)) for x in inputs))
     for real in (np.float32, np.float64):
-        run.refuses(
-            "encoder",
-            params,
-            observations | {"mode": observations["mode"].astype(real)},
-            VECTOR_TASK,
-            config,
-            naming=["mode"],
-        )
+        wrong = observations | {"mode": mode.astype(real)}
+        yield refused("encoder", params, wrong, VECTOR_TASK, config, naming=["mode"])
 
 
 @check("NET-2", "NET-24", uses=["encoder"], level=1)
-def non_finite_vectors_show(run: Run) -> None:
+def non_finite_vectors_show(setting: Setting) -> Cases:
     """NaN or infinity in a vector gives tokens that are not finite in its own row, and changes nothing in the
     others."""
-    config = config_of(run)
-    params, observations = params_of(run, config, VECTOR_TASK), observations_of(run.seed, VECTOR_TASK)
-    before = np.asarray(run.call("encoder", params, observations, VECTOR_TASK, config))
+    config = config_of(setting)
+    params, observations = params_of(setting, config, VECTOR_TASK), observations_of(setting.seed, VECTOR_TASK)
     for bad in (np.nan, np.inf):
+
+        def shows(c: Comparisons, before: np.ndarray, after: np.ndarray, bad: float = bad) -> None:
+            tokens = np.asarray(after)
+            c.holds(f"tokens with {bad} are not finite", not np.isfinite(tokens[1]).all())
+            c.exact("tokens of the other rows", tokens[[0, 2]], np.asarray(before)[[0, 2]])
+
         position = observations["position"].copy()
         position[1, 2] = bad
-        with np.errstate(invalid="ignore"):
-            tokens = np.asarray(run.call("encoder", params, observations | {"position": position}, VECTOR_TASK, config))
-        run.holds(f"tokens with {bad} are not finite", not np.isfinite(tokens[1]).all())
-        run.exact("tokens of the other rows", tokens[[0, 2]], before[[0, 2]])
+        inputs = (observations, observations | {"position": position})
+        yield related(shows, *(("encoder", (params, x, VECTOR_TASK, config)) for x in inputs))
 
 
 @check("NET-6", "NET-8", "NET-9", "NET-10", uses=["encoder"], level=1)
-def brightness_literals(run: Run) -> None:
+def brightness_literals(setting: Setting) -> Cases:
     """Brightness 0, 1, 127, 128 and 255 enters as -0.5, -0.4961, -0.00196, 0.00196 and 0.5, also in a picture that
     holds nothing else."""
     task = Spaces({"image": Image(4, 4, 1)}, ACTIONS)
-    config = config_of(run, 1, cnn_multipliers=(2, 2), cnn_depth=1, norm_epsilon=0.0)
+    config = config_of(setting, 1, cnn_multipliers=(2, 2), cnn_depth=1, norm_epsilon=0.0)
     params = zero_parameters(config, task) | {"encoder/image/conv0/bias": np.array([0.0, 1.0])}
     params["encoder/image/conv0/kernel"][1, 1, 0, 0] = 1  # the top left pixel of four, beside a constant channel
     params["encoder/image/conv1/kernel"][1, 1] = np.eye(2)
     entering = {0: -0.5, 1: -0.49607843137, 127: -0.00196078431, 128: 0.00196078431, 255: 0.5}
-    for brightness in (
-        [0, 1, 127, 128, 255],
-        [1, 0, 1, 1, 0],
-    ):  # pictures without any number above 1 are scaled like all others
+    # A picture without any number above 1 is scaled like all others.
+    for brightness in ([0, 1, 127, 128, 255], [1, 0, 1, 1, 0]):
         image = np.broadcast_to(np.array(brightness, np.uint8)[:, None, None, None], (5, 4, 4, 1)).copy()
         expected = np.array([activated(*activated(entering[number], 1)) for number in brightness])
-        bound = 1e-9 if run.u < 1e-10 else None
-        run.expect("encoder", (params, {"image": image}, task, config), expected, magnitude="tensor", bound=bound)
+        bound = 1e-9 if setting.u < 1e-10 else None
+        yield equal("encoder", (params, {"image": image}, task, config), expected, magnitude="tensor", bound=bound)
 
 
 @check("NET-8", "NET-9", uses=["encoder"], level=1)
-def pooling_comes_before_normalization(run: Run) -> None:
+def pooling_comes_before_normalization(setting: Setting) -> Cases:
     """Convolution outputs (3, 0), (0, 4), (0, 0), (0, 0) are pooled to (3, 4) and then become (0.594189, 0.855420)."""
     task = Spaces({"image": Image(4, 4, 2)}, ACTIONS)
-    config = config_of(run, 3, cnn_multipliers=(2, 2), cnn_depth=1, norm_epsilon=0.0)
+    config = config_of(setting, 3, cnn_multipliers=(2, 2), cnn_depth=1, norm_epsilon=0.0)
     params = zero_parameters(config, task) | {"encoder/image/conv0/bias": np.array([1.5, 2.0])}
     params["encoder/image/conv0/kernel"][2, 2] = np.diag([3.0, 4.0])
     params["encoder/image/conv1/kernel"][2, 2] = np.eye(2)
     image = np.zeros((1, 4, 4, 2), np.uint8)
     image[:, 0::2, 0::2, 0] = image[:, 0::2, 1::2, 1] = 255
     expected = activated(0.594189, 0.855420)[None]
-    run.expect(
-        "encoder",
-        (params, {"image": image}, task, config),
-        expected,
-        magnitude="tensor",
-        bound=2e-6 if run.u < 1e-10 else None,
-    )
+    bound = 2e-6 if setting.u < 1e-10 else None
+    yield equal("encoder", (params, {"image": image}, task, config), expected, magnitude="tensor", bound=bound)
 
 
 @check("NET-6", "NET-26", uses=["encoder"], level=1)
-def brightness_is_scaled_in_float32(run: Run) -> None:
+def brightness_is_scaled_in_float32(setting: Setting) -> Cases:
     """The two greys nearest to 0 differ by 1/255 whatever the compute dtype: bfloat16 would halve or double one of
     them."""
     task = Spaces({"image": Image(8, 8, 1)}, ACTIONS)
-    config = config_of(run, norm_epsilon=1e-12)
-    params = params_of(run, config, task)
+    config = config_of(setting, norm_epsilon=1e-12)
+    params = params_of(setting, config, task)
     params |= {
         name: np.zeros_like(value)
         for name, value in params.items()
         if name.startswith("encoder/image/") and name.endswith("bias")
     }
-    observations = {"image": run.rng().integers(127, 129, (ROWS, 8, 8, 1)).astype(np.uint8)}
+    observations = {"image": setting.rng().integers(127, 129, (ROWS, 8, 8, 1)).astype(np.uint8)}
     expected = reference.encoder(params, observations, task, config)
-    bound = {"float64": 1e-11, "float32": 1e-3, "bfloat16": 0.125}[
-        run.dtype
-    ]  # x / 255 - 1/2 loses the digits that cancel
-    run.expect("encoder", (params, observations, task, config), expected, magnitude="tensor", bound=bound)
+    # x / 255 - 1/2 loses the digits that cancel.
+    bound = {"float64": 1e-11, "float32": 1e-3, "bfloat16": 0.125}[setting.dtype]
+    yield equal("encoder", (params, observations, task, config), expected, magnitude="tensor", bound=bound)
 
 
 @check("NET-3", *(f"NET-{n}" for n in range(6, 12)), "CON-6", uses=["encoder"], level=1)
-def encoder_matches(run: Run) -> None:
+def encoder_matches(setting: Setting) -> Cases:
     """Tokens of vectors and images together and of images alone, with the kind of convolutions that the profile has."""
-    compare_encoders(run, own_convolutions(run))
+    yield from encoders(setting, own_convolutions(setting))
 
 
 @check("NET-8", "NET-9", uses=["encoder"], level=1)
-def encoder_with_other_convolutions_matches(run: Run) -> None:
+def encoder_with_other_convolutions_matches(setting: Setting) -> Cases:
     """The same with the other choices of `cnn_sampling` and `cnn_outer`."""
-    compare_encoders(run, other_convolutions(run))
+    yield from encoders(setting, other_convolutions(setting))
 
 
-def compare_encoders(run: Run, kinds: list[int]) -> None:
+def encoders(setting: Setting, kinds: list[int]) -> Cases:
     for index in kinds:
         for task in (TASK, IMAGE_TASK):
-            config = config_of(run, index)
-            params, observations = params_of(run, config, task, index), observations_of(run.seed + index, task)
+            config = config_of(setting, index)
+            params, observations = params_of(setting, config, task, index), observations_of(setting.seed + index, task)
             expected = reference.encoder(params, observations, task, config)
-            run.expect("encoder", (params, observations, task, config), expected, magnitude="tensor")
+            yield equal("encoder", (params, observations, task, config), expected, magnitude="tensor")
 
 
 @check("NET-14", "NET-18", "NET-19", "NET-26", uses=["decoder"], level=1)
-def decoder_literals(run: Run) -> None:
+def decoder_literals(setting: Setting) -> Cases:
     """With zero weights: vectors and logits are the biases as they are, images the sigmoid of theirs, computed in
     float32 or better."""
-    config = config_of(run)
+    config = config_of(setting)
     biases = {
         "decoder/vector/out/position/bias": np.array([20.0, -3.0, 0.5]),
         "decoder/vector/out/Speed/bias": np.array([-200.0, 0.0]),
         "decoder/vector/out/mode/bias": np.array([1.0, 2.0, -300.0, 8.0, 0.25]),
         "decoder/image/out/bias": np.array([0.0, 8.0, -1.5, 6.0]),
     }
-    feature = features_of(run, config, ROWS)
-    decoded = run.call("decoder", zero_parameters(config, TASK) | biases, feature, TASK, config)
-    run.holds("the keys are those of the observations", set(decoded) == set(TASK.observations))
-    for key in ("position", "Speed", "mode"):
-        run.exact(key, decoded[key], np.tile(biases[f"decoder/vector/out/{key}/bias"], (ROWS, 1)))
+    feature = features_of(setting, config, ROWS)
     sigmoids = {"depth": [0.5], "image": [0.9996646498695336, 0.18242552380635635, 0.9975273768433653]}
-    for key, values in sigmoids.items():
-        run.compare(key, decoded[key], np.broadcast_to(values, (ROWS, 8, 12, len(values))), bound=64 * run.u)
+
+    def keys(c: Comparisons, decoded: Any) -> None:
+        c.holds("the keys are those of the observations", set(decoded) == set(TASK.observations))
+
+    yield judged(
+        "decoder",
+        (zero_parameters(config, TASK) | biases, feature, TASK, config),
+        keys,
+        *(
+            exactly(np.tile(biases[f"decoder/vector/out/{key}/bias"], (ROWS, 1)), at=(key,), where=key)
+            for key in ("position", "Speed", "mode")
+        ),
+        *(
+            Equal(np.broadcast_to(values, (ROWS, 8, 12, len(values))), at=(key,), where=key, bound=64 * setting.u)
+            for key, values in sigmoids.items()
+        ),
+    )
 
 
 @check("NET-16", "NET-17", "NET-19", uses=["decoder"], level=1)
-def stem_literals(run: Run) -> None:
+def stem_literals(setting: Setting) -> Cases:
     """2 blocks, a 1 x 2 map of 4 channels: outputs 0 1 4 5 and 2 3 6 7 of the memory, 0 1 2 3 and 4 5 6 7 of the
     latents share a pixel."""
     task = Spaces({"wide": Image(4, 8, 3), "thin": Image(4, 8, 1)}, ACTIONS)
-    config = config_of(run, 1, cnn_multipliers=(4, 4), cnn_depth=1, norm_epsilon=1e-20)
+    config = config_of(setting, 1, cnn_multipliers=(4, 4), cnn_depth=1, norm_epsilon=1e-20)
     params = zero_parameters(config, task)
-    params["decoder/image/conv0/kernel"][1, 1] = params["decoder/image/out/kernel"][1, 1] = np.eye(
-        4
-    )  # pixel i becomes pixel 2i
+    # Pixel i becomes pixel 2i.
+    params["decoder/image/conv0/kernel"][1, 1] = params["decoder/image/out/kernel"][1, 1] = np.eye(4)
     numbers = np.arange(8.0)
-    cases = {
-        "deter": ([0, 1, 4, 5], [2, 3, 6, 7]),
-        "stoch": ([0, 1, 2, 3], [4, 5, 6, 7]),
-    }
+    cases = {"deter": ([0, 1, 4, 5], [2, 3, 6, 7]), "stoch": ([0, 1, 2, 3], [4, 5, 6, 7])}
     for name, pixels in cases.items():
         expected = np.full((1, 4, 8, 4), 0.5)
         for column, values in zip((0, 4), pixels, strict=True):
             expected[0, 0, column] = 1 / (1 + np.exp(-activated(*activated(*values))))
-        arguments = params | {f"decoder/image/{name}/bias": numbers}, features_of(run, config, 1), task, config
-        run.expect("decoder", arguments, {"thin": expected[..., :1], "wide": expected[..., 1:]}, magnitude="tensor")
+        arguments = params | {f"decoder/image/{name}/bias": numbers}, features_of(setting, config, 1), task, config
+        yield equal("decoder", arguments, {"thin": expected[..., :1], "wide": expected[..., 1:]}, magnitude="tensor")
 
 
 @check(*(f"NET-{n}" for n in range(13, 20)), "NET-1", uses=["decoder"], level=1)
-def decoder_matches(run: Run) -> None:
+def decoder_matches(setting: Setting) -> Cases:
     """Reconstructions of vectors and images together and of each alone, with the kind of convolutions that the profile
     has."""
-    compare_decoders(run, own_convolutions(run), (TASK, IMAGE_TASK, VECTOR_TASK))
+    yield from decoders(setting, own_convolutions(setting), (TASK, IMAGE_TASK, VECTOR_TASK))
 
 
 @check("NET-17", "NET-18", uses=["decoder"], level=1)
-def decoder_with_other_convolutions_matches(run: Run) -> None:
+def decoder_with_other_convolutions_matches(setting: Setting) -> Cases:
     """Vectors and images together with the other choices of `cnn_sampling` and `cnn_outer`."""
-    compare_decoders(run, other_convolutions(run), (TASK,))
+    yield from decoders(setting, other_convolutions(setting), (TASK,))
 
 
-def compare_decoders(run: Run, kinds: list[int], tasks: tuple[Spaces, ...]) -> None:
+def decoders(setting: Setting, kinds: list[int], tasks: tuple[Spaces, ...]) -> Cases:
     for index in kinds:
         for task in tasks:
-            config = config_of(run, index, decoder_layers=2 + index % 2)
-            params, feature = params_of(run, config, task, index), features_of(run, config, ROWS, seed=index)
+            config = config_of(setting, index, decoder_layers=2 + index % 2)
+            params, feature = params_of(setting, config, task, index), features_of(setting, config, ROWS, seed=index)
             expected = reference.decoder(params, feature, task, config)
-            actual = run.expect("decoder", (params, feature, task, config), expected, magnitude=largest(expected))
-            for key in task.images:
-                run.holds(
-                    f"{key} lies between 0 and 1", (np.asarray(actual[key]) >= 0) & (np.asarray(actual[key]) <= 1)
-                )
+            golden = Equal(expected, magnitude=largest(expected))
+            yield judged("decoder", (params, feature, task, config), golden, images_are_brightness)
+
+
+def images_are_brightness(c: Comparisons, decoded: Any) -> None:
+    for key in IMAGES:
+        if key in decoded:
+            image = np.asarray(decoded[key])
+            c.holds(f"{key} lies between 0 and 1", (image >= 0) & (image <= 1))
 
 
 @check("NET-15", "NET-16", "NET-1", uses=["decoder"], level=1)
-def image_decoder_separates_memory_and_latents(run: Run) -> None:
+def image_decoder_separates_memory_and_latents(setting: Setting) -> Cases:
     """With only the memory's or only the latents' path, images depend on the first deter entries of the feature or on
     the others alone."""
-    config = config_of(run)
-    params, feature = params_of(run, config, IMAGE_TASK), features_of(run, config, ROWS)
+    config = config_of(setting)
+    params, feature = params_of(setting, config, IMAGE_TASK), features_of(setting, config, ROWS)
     for path, kept in (("deter", slice(0, config.deter)), ("stoch", slice(config.deter, None))):
         other = "stoch" if path == "deter" else "deter"
         silenced = params | {
             f"decoder/image/{other}/{part}": 0 * params[f"decoder/image/{other}/{part}"] for part in ("kernel", "bias")
         }
-        changed = features_of(run, config, ROWS, seed=1)
+        changed = features_of(setting, config, ROWS, seed=1)
         changed[:, kept] = feature[:, kept]
-        before = run.call("decoder", silenced, feature, IMAGE_TASK, config)
-        after = run.call("decoder", silenced, changed, IMAGE_TASK, config)
-        for key in IMAGES:
-            run.exact(f"{key} by {path} alone", after[key], before[key])
-            run.holds(f"{key} differs between rows", not np.array_equal(before[key][0], before[key][1]))
+
+        def same(c: Comparisons, before: Any, after: Any, path: str = path) -> None:
+            for key in IMAGES:
+                c.exact(f"{key} by {path} alone", after[key], before[key])
+                c.holds(f"{key} differs between rows", not np.array_equal(before[key][0], before[key][1]))
+
+        yield related(same, *(("decoder", (silenced, x, IMAGE_TASK, config)) for x in (feature, changed)))
 
 
 @check("NET-20", "NET-21", "NET-22", "NET-26", uses=[*HEADS, "actor"], level=1)
-def heads_literals(run: Run) -> None:
+def heads_literals(setting: Setting) -> Cases:
     """With zero weights every head returns the biases of its output layer exactly: no tanh, no sigmoid, no mixture."""
-    config = config_of(run)
+    config = config_of(setting)
     logits = np.arange(-15.0, 16) * 8
     params = zero_parameters(config, VECTOR_TASK) | {
         "reward/out/bias": logits,
@@ -354,80 +354,90 @@ def heads_literals(run: Run) -> None:
     for key, outputs in biases.items():
         params |= {f"actor/out/{key}/{output}/bias": np.array(values) for output, values in outputs.items()}
     params = {name: np.asarray(value, np.float64) for name, value in params.items()}
-    feature = features_of(run, config, ROWS)
-    run.exact("reward_head", run.call("reward_head", params, feature, config), np.tile(logits, (ROWS, 1)))
-    run.exact("critic", run.call("critic", params, feature, config), np.tile(-logits, (ROWS, 1)))
-    run.exact("continue_head", run.call("continue_head", params, feature, config), np.full(ROWS, -300.0))
-    actual = run.call("actor", params, feature, VECTOR_TASK, config)
-    run.holds("the keys are those of the actions", set(actual) == set(biases))
-    for key, outputs in biases.items():
-        run.holds(f"the outputs of {key}", set(actual[key]) == set(outputs))
-        for output, values in outputs.items():
-            run.exact(f"{key} {output}", actual[key][output], np.tile(values, (ROWS, 1)))
+    feature = features_of(setting, config, ROWS)
+    yield exact("reward_head", (params, feature, config), np.tile(logits, (ROWS, 1)))
+    yield exact("critic", (params, feature, config), np.tile(-logits, (ROWS, 1)))
+    yield exact("continue_head", (params, feature, config), np.full(ROWS, -300.0))
+
+    def keys(c: Comparisons, actual: Any) -> None:
+        c.holds("the keys are those of the actions", set(actual) == set(biases))
+        for key, outputs in biases.items():
+            c.holds(f"the outputs of {key}", set(actual[key]) == set(outputs))
+
+    yield judged(
+        "actor",
+        (params, feature, VECTOR_TASK, config),
+        keys,
+        *(
+            exactly(np.tile(values, (ROWS, 1)), at=(key, output), where=f"{key} {output}")
+            for key, outputs in biases.items()
+            for output, values in outputs.items()
+        ),
+    )
 
 
 @check("NET-1", "NET-20", "NET-21", "NET-22", uses=[*HEADS, "actor"], level=1)
-def heads_match(run: Run) -> None:
+def heads_match(setting: Setting) -> Cases:
     """Random features of several scales, and other depths than usual."""
     layers = {f"{name}_layers": depth for name, depth in (("reward", 2), ("continue", 3), ("critic", 1), ("actor", 2))}
 
-    @run.for_all(seed=seeds(), overrides=st.sampled_from([{}, layers]), scale=st.sampled_from([1e-2, 1.0, 30.0]))
-    def _(seed: int, overrides: dict[str, Any], scale: float) -> None:
-        config = config_of(run, **overrides)
-        params = params_of(run, config, VECTOR_TASK, seed)
-        feature = run.cast(normals(seed, ROWS, config.feature_size, scale=scale))
+    def case(seed: int, overrides: dict[str, Any], scale: float) -> Cases:
+        config = config_of(setting, **overrides)
+        params = params_of(setting, config, VECTOR_TASK, seed)
+        feature = setting.cast(normals(seed, ROWS, config.feature_size, scale=scale))
         for head in HEADS:
             expected = getattr(reference, head)(params, feature, config)
-            run.expect(head, (params, feature, config), expected, magnitude=largest(expected))
+            yield equal(head, (params, feature, config), expected, magnitude=largest(expected))
         expected = reference.actor(params, feature, VECTOR_TASK, config)
-        run.expect("actor", (params, feature, VECTOR_TASK, config), expected, magnitude=largest(expected))
+        yield equal("actor", (params, feature, VECTOR_TASK, config), expected, magnitude=largest(expected))
+
+    yield Drawn(case, seed=seeds(), overrides=st.sampled_from([{}, layers]), scale=st.sampled_from([1e-2, 1.0, 30.0]))
 
 
 @check("NET-23", uses=["critic"], level=1)
-def critic_reads_the_slow_critic(run: Run) -> None:
+def critic_reads_the_slow_critic(setting: Setting) -> Cases:
     """The critic of a mapping that holds nothing but `critic/...`."""
-    config = config_of(run)
-    params, feature = params_of(run, config, VECTOR_TASK), features_of(run, config, ROWS)
+    config = config_of(setting)
+    params, feature = params_of(setting, config, VECTOR_TASK), features_of(setting, config, ROWS)
     slow = {name: round_to(value * 1.25, "float32") for name, value in params.items() if name.startswith("critic/")}
-    run.expect("critic", (slow, feature, config), reference.critic(slow, feature, config), magnitude="tensor")
+    yield equal("critic", (slow, feature, config), reference.critic(slow, feature, config), magnitude="tensor")
 
 
 @check("NET-24", uses=["encoder", "decoder", *HEADS, "actor"], level=1)
-def leading_axes(run: Run) -> None:
+def leading_axes(setting: Setting) -> Cases:
     """No leading axes, or two of them."""
-    config = config_of(run)
-    params = params_of(run, config)
+    config = config_of(setting)
+    params = params_of(setting, config)
     for leading in ((), (2, 2)):
-        observations, feature = observations_of(run.seed, TASK, leading), features_of(run, config, *leading)
+        observations, feature = observations_of(setting.seed, TASK, leading), features_of(setting, config, *leading)
         expected = reference.encoder(params, observations, TASK, config)
-        run.expect("encoder", (params, observations, TASK, config), expected, magnitude="tensor")
+        yield equal("encoder", (params, observations, TASK, config), expected, magnitude="tensor")
         for network in (*HEADS, "decoder", "actor"):
             arguments = (params, feature, config) if network in HEADS else (params, feature, TASK, config)
             expected = getattr(reference, network)(*arguments)
-            run.expect(network, arguments, expected, magnitude=largest(expected))
+            yield equal(network, arguments, expected, magnitude=largest(expected))
 
 
 @check("NET-24", uses=["encoder", "decoder", *HEADS, "actor"], level=1)
-def rows_do_not_influence_each_other(run: Run) -> None:
+def rows_do_not_influence_each_other(setting: Setting) -> Cases:
     """Other observations or features in one row change nothing in the others."""
-    config = config_of(run)
-    params, observations, feature = (
-        params_of(run, config),
-        observations_of(run.seed, TASK),
-        features_of(run, config, ROWS),
-    )
+    config = config_of(setting)
+    params, observations = params_of(setting, config), observations_of(setting.seed, TASK)
     changed = {key: value.copy() for key, value in observations.items()}
     for value in changed.values():
         value[0] = 1
-    before, after = (run.call("encoder", params, x, TASK, config) for x in (observations, changed))
-    run.exact("encoder", np.asarray(after)[1:], np.asarray(before)[1:])
+    feature = features_of(setting, config, ROWS)
     spoiled = feature.copy()
     spoiled[0] = np.nan
-    for network in (*HEADS, "decoder", "actor"):
+    for network in ("encoder", *HEADS, "decoder", "actor"):
+
+        def same(c: Comparisons, before: Any, after: Any, network: str = network) -> None:
+            for name, array in flat(before).items():
+                c.exact(f"{network}{name}", flat(after)[name][1:], array[1:])
+
+        inputs = (observations, changed) if network == "encoder" else (feature, spoiled)
         rest = (config,) if network in HEADS else (TASK, config)
-        before, after = (flat(run.call(network, params, x, *rest)) for x in (feature, spoiled))
-        for name in before:
-            run.exact(f"{network}{name}", after[name][1:], before[name][1:])
+        yield related(same, *((network, (params, x, *rest)) for x in inputs))
 
 
 def flat(result: Any, name: str = "") -> dict[str, np.ndarray]:
@@ -438,57 +448,44 @@ def flat(result: Any, name: str = "") -> dict[str, np.ndarray]:
 
 
 @check("NET-12", uses=["encoder"], level=1)
-def sides_that_cannot_be_halved(run: Run) -> None:
+def sides_that_cannot_be_halved(setting: Setting) -> Cases:
     """A height or width that is no multiple of two to the number of halvings is refused before any network runs."""
     for index in range(len(CONVOLUTIONS)):
         for height, width in ((10, 12), (8, 6), (9, 8)):
             task = Spaces({"image": Image(height, width, 1), "position": Vector(2)}, ACTIONS)
-            run.refuses("encoder", {}, observations_of(run.seed, task), task, config_of(run, index))
+            yield refused("encoder", {}, observations_of(setting.seed, task), task, config_of(setting, index))
 
 
 @check("NET-2", "NET-6", "NET-27", "CON-6", "CON-8", uses=["encoder"], level=1)
-def encoder_refuses(run: Run) -> None:
+def encoder_refuses(setting: Setting) -> Cases:
     """A missing key, a shape that does not fit, different numbers of rows, and images that are not uint8 are
     refused."""
-    config = config_of(run)
-    params, observations = params_of(run, config), observations_of(run.seed, TASK)
+    config = config_of(setting)
+    params, observations = params_of(setting, config), observations_of(setting.seed, TASK)
     for key, value in observations.items():
-        run.refuses(
-            "encoder", params, {name: x for name, x in observations.items() if name != key}, TASK, config, naming=[key]
-        )
+        missing = {name: x for name, x in observations.items() if name != key}
+        yield refused("encoder", params, missing, TASK, config, naming=[key])
         shorter = value[..., :-1]
-        run.refuses(
-            "encoder",
-            params,
-            observations | {key: shorter},
-            TASK,
-            config,
-            naming=[key, ", ".join(map(str, shorter.shape))],
-        )
+        naming = [key, ", ".join(map(str, shorter.shape))]
+        yield refused("encoder", params, observations | {key: shorter}, TASK, config, naming=naming)
         for rows in (1, 2):
-            run.refuses("encoder", params, observations | {key: value[:rows]}, TASK, config)
+            yield refused("encoder", params, observations | {key: value[:rows]}, TASK, config)
     for dtype in (np.float32, np.int64, np.int8):
-        run.refuses(
-            "encoder",
-            params,
-            observations | {"image": observations["image"].astype(dtype)},
-            TASK,
-            config,
-            naming=["image"],
-        )
+        wrong = observations | {"image": observations["image"].astype(dtype)}
+        yield refused("encoder", params, wrong, TASK, config, naming=["image"])
     flipped = observations | {"image": observations["image"].swapaxes(1, 2).copy()}
-    run.refuses("encoder", params, flipped, TASK, config)
+    yield refused("encoder", params, flipped, TASK, config)
 
 
 @check("NET-27", "CON-8", uses=["decoder", *HEADS, "actor"], level=1)
-def features_of_other_sizes_are_refused(run: Run) -> None:
+def features_of_other_sizes_are_refused(setting: Setting) -> Cases:
     """A feature that is not deter + stoch x classes long is refused."""
-    config = config_of(run)
-    params = params_of(run, config)
+    config = config_of(setting)
+    params = params_of(setting, config)
     wider = dataclasses.replace(config, deter=config.deter + 2)
     for size in (config.feature_size - 1, config.feature_size + 1, 1):
         for head in HEADS:
-            run.refuses(head, params, np.zeros((ROWS, size)), config, naming=["feature", f"{ROWS}, {size}"])
+            yield refused(head, params, np.zeros((ROWS, size)), config, naming=["feature", f"{ROWS}, {size}"])
         for network in ("decoder", "actor"):
-            run.refuses(network, params, np.zeros((ROWS, size)), TASK, config, naming=["feature", f"{ROWS}, {size}"])
-    run.refuses("reward_head", params, np.zeros((ROWS, config.feature_size)), wider)
+            yield refused(network, params, np.zeros((ROWS, size)), TASK, config, naming=["feature", f"{ROWS}, {size}"])
+    yield refused("reward_head", params, np.zeros((ROWS, config.feature_size)), wider)
