@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from conformance.candidate import ModuleAdapter
-from conformance.execute import Settings, run_check, selected_checks
+from conformance.execute import CheckOptions, run_check, selected_checks
 from conformance.expected import ExpectedFailures
 from conformance.offered import offered
 from conformance.results import result_data
@@ -53,7 +53,7 @@ def rms_norm(x, scale, epsilon):
 """
 
 
-def settings(**changes: Any) -> Settings:
+def settings(**changes: Any) -> CheckOptions:
     base = {
         "candidate": "mine.py",
         "process": False,
@@ -62,7 +62,7 @@ def settings(**changes: Any) -> Settings:
         "edition": "paper",
         "only": "",
     }
-    return Settings(**{**base, "seed": 3, "examples": 5, "at_least": 1, **changes})
+    return CheckOptions(**{**base, "seed": 3, "examples": 5, "at_least": 1, **changes})
 
 
 def adapter(source: str = ADAPTER) -> ModuleAdapter:
@@ -75,7 +75,7 @@ def make(
     names: tuple[str, ...] = (PASS, FAIL, ERROR, ABSENT), reasons: Mapping[str, str] | None = None, **changes: Any
 ) -> dict[str, Any]:
     asked = settings(**changes)
-    results = [run_check(CHECKS[name], adapter(), "float64", "paper", asked.seed, asked.examples) for name in names]
+    results = [run_check(CHECKS[name], adapter(), asked.setting) for name in names]
     return result_data(
         asked,
         {"name": "mine", "version": "1.2", "edition": None, "offered": offered(adapter())},

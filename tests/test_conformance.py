@@ -6,7 +6,9 @@ What CI runs is float64 for both backends, and for PyTorch both profiles and flo
 import pytest
 
 from conformance.adapter import load_adapter
-from conformance.check import DTYPES, Check
+from conformance.case import Setting
+from conformance.check import Check
+from conformance.compare import DTYPES
 from conformance.execute import run_check, selected_checks
 from impl_torch import layers
 
@@ -38,7 +40,7 @@ CASES = [
 
 @pytest.mark.parametrize(("backend", "dtype", "profile", "check"), CASES)
 def test_the_backend_passes(backend: str, dtype: str, profile: str, check: Check) -> None:
-    result = run_check(check, load_adapter(backend, dtype), dtype, profile, examples=5)
+    result = run_check(check, load_adapter(backend, dtype), Setting(dtype, profile, examples=5))
     assert result.status in ("pass", "not offered"), result.message
 
 
@@ -53,7 +55,7 @@ ROUTED = [
 def test_products_of_many_rows_are_the_same(check: Check, monkeypatch: pytest.MonkeyPatch) -> None:
     """PyTorch computes products of many rows by another route, which the small problems of the kit would not take."""
     monkeypatch.setattr(layers, "CONVOLUTION_ROWS", 1)
-    result = run_check(check, load_adapter("torch", "float32"), "float32", "paper", examples=5)
+    result = run_check(check, load_adapter("torch", "float32"), Setting("float32", "paper", examples=5))
     assert result.status in ("pass", "not offered"), result.message
 
 

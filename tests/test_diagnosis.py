@@ -12,7 +12,8 @@ import torch
 
 from conformance.adapter import load_adapter
 from conformance.adapters.numpy_adapter import NumpyAdapter
-from conformance.check import Worst
+from conformance.case import Setting
+from conformance.compare import Worst
 from conformance.diagnosis import Diagnosis, diagnose
 from conformance.execute import Result, run_check, selected_checks
 from conformance.mutants import MUTANTS, MutantAdapter, PlantedAdapter, relevant, sound, trial
@@ -31,7 +32,7 @@ def diagnosed(name: str) -> list[Diagnosis]:
     mutant = MUTANTS[name]
     results = list(trial(mutant, relevant(mutant, reach()), EXAMPLES))
     unmoved = [Result(check, "pass", Worst(), 1) for check in reach() if not reach()[check] & mutant.edits.keys()]
-    return diagnose(MutantAdapter(mutant), results + unmoved, "float64", "paper", 0, EXAMPLES)
+    return diagnose(MutantAdapter(mutant), results + unmoved, Setting("float64", "paper", 0, EXAMPLES))
 
 
 @pytest.mark.parametrize(
@@ -46,8 +47,8 @@ def test_the_mutant_is_named(name: str) -> None:
 def diagnose_in(adapter: object, *only: str, dtype: str = "float64") -> list[Diagnosis]:
     """Of an adapter, from the checks whose name or requirements contain one of these texts."""
     checks = [check for text in only for check in selected_checks(dtype, text)]
-    results = [run_check(check, adapter, dtype, "paper", examples=EXAMPLES, shrink=False) for check in checks]
-    return diagnose(adapter, results, dtype, "paper", examples=EXAMPLES)
+    results = [run_check(check, adapter, Setting(dtype, "paper", examples=EXAMPLES), shrink=False) for check in checks]
+    return diagnose(adapter, results, Setting(dtype, "paper", examples=EXAMPLES))
 
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])

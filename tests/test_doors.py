@@ -21,6 +21,7 @@ from conformance.adapters.numpy_adapter import NumpyAdapter
 from conformance.adapters.torch_adapter import TorchAdapter
 from conformance.adapters.without_noise import WithoutNoise
 from conformance.candidate import ModuleAdapter, remarks
+from conformance.case import Setting
 from conformance.errors import UserError
 from conformance.execute import Result, run_check, selected_checks
 from conformance.foreign import arranged
@@ -44,7 +45,7 @@ def module(**functions: Any) -> ModuleAdapter:
 
 
 def run(name: str, adapter: object, dtype: str = "float64") -> Result:
-    return run_check(CHECKS[name], adapter, dtype, "paper", examples=5)
+    return run_check(CHECKS[name], adapter, Setting(dtype, "paper", examples=5))
 
 
 # --- What comes back
@@ -261,14 +262,16 @@ class PoolsOnly(NumpyAdapter):
 def test_what_is_not_implemented_is_not_offered() -> None:
     names = ("encoder_matches", "encoder_with_other_convolutions_matches")
     for profile, statuses in (("official", ["pass", "not offered"]), ("paper", ["not offered", "not offered"])):
-        results = [run_check(CHECKS[f"networks.{name}"], PoolsOnly(), "float64", profile) for name in names]
+        results = [run_check(CHECKS[f"networks.{name}"], PoolsOnly(), Setting("float64", profile)) for name in names]
         assert [result.status for result in results] == statuses
         assert {result.message for result in results if result.message} == {
             "not implemented: encoder (strided convolutions)"
         }
     rest = [check for name, check in CHECKS.items() if name.startswith("networks.") and "encoder" in check.uses]
     found = {
-        check.name for check in rest if run_check(check, PoolsOnly(), "float64", "official").status == "not offered"
+        check.name
+        for check in rest
+        if run_check(check, PoolsOnly(), Setting("float64", "official")).status == "not offered"
     }
     assert found == {"networks.brightness_literals", "networks.encoder_with_other_convolutions_matches"}
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from conformance.adapters.numpy_adapter import NumpyAdapter
-from conformance.check import Check, Run
+from conformance.case import Cases, Setting, exact, refused
+from conformance.check import Check
 from conformance.cli import main
 from conformance.editions import (
     NOT_JUDGED,
@@ -132,7 +133,9 @@ def test_the_mutants_of_an_edition_go_together_and_are_seen(name: str) -> None:
             if requirement in check.requirements and "loss_derivatives" not in check.uses
         ]
         found = (
-            run_check(check, MutantAdapter(mutant), "float64", editions()[name].profile, examples=5, shrink=False)
+            run_check(
+                check, MutantAdapter(mutant), Setting("float64", editions()[name].profile, examples=5), shrink=False
+            )
             for check in checks
         )
         assert any(result.status in ("fail", "error") for result in found), requirement
@@ -198,11 +201,11 @@ def test_what_the_edition_refuses_must_be_refused() -> None:
         except ValueError:
             return np.zeros(np.size(bins))
 
-    def expects(run: Run) -> None:
-        run.exact("twohot", run.call("twohot", np.array(0.3), np.array([-2.0, 0, 2])), np.zeros(3))
-        run.refuses("twohot", np.array(0.3), np.zeros((2, 2)))
+    def expects(setting: Setting) -> Cases:
+        yield exact("twohot", (np.array(0.3), np.array([-2.0, 0, 2])), np.zeros(3))
+        yield refused("twohot", np.array(0.3), np.zeros((2, 2)))
 
-    check = Check("transforms.made_up", ("TRA-7",), ("twohot",), 0, expects, ("float64",))
+    check = Check("transforms.made_up", ("TRA-7",), ("twohot",), 0, ("float64",), "", expects)
     for function, status in ((right, "pass"), (careless, "fail")):
         result = judge(check, types.SimpleNamespace(twohot=function), editions()["2023"], "float64")
         assert result.status == status, result.message

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from conformance.case import Setting
 from conformance.cli import main
 from conformance.execute import missing, run_check, selected_checks
 
@@ -24,7 +25,7 @@ def test_only_callables_are_offered() -> None:
     check = next(check for check in CHECKS.values() if "losses" in check.uses)
     mine = adapter(losses=types.ModuleType("losses"))
     assert "losses" in missing(mine, check)
-    assert run_check(check, mine, "float64", "paper").status == "not offered"
+    assert run_check(check, mine, Setting("float64", "paper")).status == "not offered"
     assert "losses" not in missing(adapter(losses=lambda *arguments: None), check)
 
 
@@ -32,7 +33,7 @@ def test_what_the_candidate_raises_is_a_result() -> None:
     def broken(x: np.ndarray) -> np.ndarray:
         raise KeyError("oops")
 
-    result = run_check(CHECKS["transforms.symlog_matches"], adapter(symlog=broken), "float64", "paper")
+    result = run_check(CHECKS["transforms.symlog_matches"], adapter(symlog=broken), Setting("float64", "paper"))
     assert result.status == "error"
     assert "oops" in result.message
 
@@ -43,15 +44,15 @@ def test_a_candidate_cannot_end_the_kit() -> None:
             raise SystemExit(0)
 
     check = next(check for check in CHECKS.values() if check.uses == ("Replay",))
-    assert run_check(check, adapter(Replay=Replay), "float64", "paper").status == "error"
+    assert run_check(check, adapter(Replay=Replay), Setting("float64", "paper")).status == "error"
 
 
 def test_a_right_and_a_wrong_function() -> None:
     check = CHECKS["transforms.symlog_matches"]
-    right = run_check(check, adapter(symlog=lambda x: np.sign(x) * np.log1p(np.abs(x))), "float64", "paper")
+    right = run_check(check, adapter(symlog=lambda x: np.sign(x) * np.log1p(np.abs(x))), Setting("float64", "paper"))
     assert right.status == "pass", right.message
     with np.errstate(all="ignore"):
-        wrong = run_check(check, adapter(symlog=lambda x: np.sign(x) * np.log(np.abs(x))), "float64", "paper")
+        wrong = run_check(check, adapter(symlog=lambda x: np.sign(x) * np.log(np.abs(x))), Setting("float64", "paper"))
     assert (wrong.status, "symlog" in wrong.message) == ("fail", True)
 
 
@@ -63,7 +64,7 @@ def test_two_deviations_are_a_deviation() -> None:
         return right[..., None] if np.ndim(x) > 1 else right + 1
 
     result = run_check(
-        CHECKS["transforms.symlog_matches"], adapter(symlog=two_mistakes), "float64", "paper", examples=200
+        CHECKS["transforms.symlog_matches"], adapter(symlog=two_mistakes), Setting("float64", "paper", examples=200)
     )
     assert result.status == "fail", result.message
 

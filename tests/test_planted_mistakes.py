@@ -12,8 +12,10 @@ import pytest
 from conformance import cli
 from conformance.adapter import load_adapter
 from conformance.adapters.numpy_adapter import NumpyAdapter
-from conformance.check import Check, Run, round_to
+from conformance.case import Cases, Setting, equal, exact, judged
+from conformance.check import Check
 from conformance.commands import mutants as command
+from conformance.compare import round_to
 from conformance.execute import run_check, selected_checks
 from conformance.mutants import MUTANTS, Mutant, relevant, sound, trial
 from conformance.requirements import chapter_of, requirements
@@ -64,7 +66,7 @@ def test_a_mistake_that_does_not_fit_the_source_is_an_error() -> None:
 @pytest.mark.parametrize("profile", ["paper", "official"])
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.name)
 def test_the_reference_passes(check, profile: str) -> None:
-    result = run_check(check, NumpyAdapter(), "float64", profile)
+    result = run_check(check, NumpyAdapter(), Setting("float64", profile))
     assert result.status in ("pass", "not offered"), result.message
 
 
@@ -85,23 +87,23 @@ def test_broken_checks_catch_nothing(
     """Deviations and what raises are counted apart, and a check that the reference does not pass is not counted at
     all."""
 
-    def deviates(run: Run) -> None:
-        run.exact("silu", run.call("silu", np.zeros(1)), np.ones(1))
+    def deviates(setting: Setting) -> Cases:
+        yield exact("silu", (np.zeros(1),), np.ones(1))
 
-    def raises(run: Run) -> None:
-        raise KeyError("oops")
+    def raises(setting: Setting) -> Cases:
+        yield judged("silu", (np.zeros(1),), lambda c, result: c.holds("a key", {}["oops"]))
 
-    def right(run: Run) -> None:
-        run.exact("symlog", run.call("symlog", np.zeros(1)), np.zeros(1))
+    def right(setting: Setting) -> Cases:
+        yield exact("symlog", (np.zeros(1),), np.zeros(1))
 
-    def literal(run: Run) -> None:
-        run.expect("silu", (np.ones(1),), np.array([0.7310586]), bound=1e-6)
+    def literal(setting: Setting) -> Cases:
+        yield equal("silu", (np.ones(1),), np.array([0.7310586]), bound=1e-6)
 
-    def index(run: Run) -> None:
-        run.holds("a number", run.call("silu", np.ones(1))[0] > 0)
+    def index(setting: Setting) -> Cases:
+        yield judged("silu", (np.ones(1),), lambda c, result: c.holds("a number", result[0] > 0))
 
-    bodies = (deviates, raises, right, literal, index)
-    checks = [Check(f"row.{body.__name__}", (), ("silu",), 0, body, ("float64",)) for body in bodies]
+    builders = (deviates, raises, right, literal, index)
+    checks = [Check(f"row.{build.__name__}", (), ("silu",), 0, ("float64",), "", build) for build in builders]
     planted = {
         "harmless": silu_mutant("harmless", "(x / (1.0 + np.exp(-x)))"),
         "scalar": silu_mutant("scalar", "np.float64(0.5)"),
@@ -137,7 +139,7 @@ def test_only_relevant_checks_are_run() -> None:
 
 
 def run_narrow(name: str, adapter: object) -> tuple[str, str]:
-    result = run_check(NARROW_CHECKS[name], adapter, "bfloat16", "paper", examples=5)
+    result = run_check(NARROW_CHECKS[name], adapter, Setting("bfloat16", "paper", examples=5))
     return result.status, result.message
 
 
@@ -191,4 +193,4 @@ def test_swapped_weights_of_the_kl_losses_are_seen(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(torch_agent, "loss_scale", lambda name, config: right(swapped.get(name, name), config))
     checks = {check.name: check for check in CHECKS}
     for name, status in (("agent.losses_match", "pass"), ("agent.total_gradient_is_the_weighted_sum", "fail")):
-        assert run_check(checks[name], load_adapter("torch"), "float64", "paper").status == status
+        assert run_check(checks[name], load_adapter("torch"), Setting("float64", "paper")).status == status

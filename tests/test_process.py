@@ -20,8 +20,9 @@ import pytest
 from conformance import process
 from conformance.adapter import OBJECTS
 from conformance.adapters.numpy_adapter import NumpyAdapter
-from conformance.check import CandidateLost
+from conformance.case import Setting
 from conformance.cli import main
+from conformance.compare import CandidateLost
 from conformance.errors import UserError
 from conformance.execute import Result, missing, run_check, selected_checks
 from conformance.problems import small_config, spaces
@@ -48,7 +49,7 @@ def fake(mode: str = "", timeout: float = 60.0) -> Iterator[ProcessAdapter]:
 
 
 def result_of(adapter: object) -> Result:
-    return run_check(CHECKS["transforms.symlog_matches"], adapter, "float64", "paper", examples=2)
+    return run_check(CHECKS["transforms.symlog_matches"], adapter, Setting("float64", "paper", examples=2))
 
 
 def test_a_right_implementation_passes() -> None:
@@ -390,7 +391,7 @@ def test_what_is_not_implemented_is_not_offered(tmp_path: Path) -> None:
     adapter = ProcessAdapter(
         shlex.join([sys.executable, "-m", "conformance.serve", str(tmp_path / "mine.py")]), "float64", 60.0
     )
-    result = run_check(CHECKS["transforms.symlog_matches"], adapter, "float64", "paper")
+    result = run_check(CHECKS["transforms.symlog_matches"], adapter, Setting("float64", "paper"))
     assert (result.status, result.message) == ("not offered", "not implemented: symlog (negative numbers)")
     adapter.close()
 
@@ -417,7 +418,7 @@ def test_the_server_needs_only_numpy() -> None:
     assert imported - set(sys.stdlib_module_names) == {"numpy"}
     assert "pickle" not in imported
     code = (
-        "import sys, conformance.serve; print({'hypothesis', 'rich', 'spec', 'conformance.check'} & set(sys.modules))"
+        "import sys, conformance.serve; print({'hypothesis', 'rich', 'spec', 'conformance.compare'} & set(sys.modules))"
     )
     assert (
         subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True).stdout
@@ -483,7 +484,7 @@ def test_every_check_works_through_a_process(monkeypatch: pytest.MonkeyPatch) ->
         "float64",
         60.0,
     )
-    results = [run_check(check, adapter, "float64", "paper", examples=1) for check in CHECKS.values()]
+    results = [run_check(check, adapter, Setting("float64", "paper", examples=1)) for check in CHECKS.values()]
     adapter.close()
     assert [result.message for result in results if result.status in ("fail", "error")] == []
     reference = NumpyAdapter()

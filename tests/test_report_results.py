@@ -16,15 +16,18 @@ import numpy as np
 import pytest
 from report_data import ABSENT, ADAPTER, CHECKS, ERROR, FAIL, PASS, adapter, make, settings
 
-from conformance.check import Call, Run
+from conformance.case import Call, Case, Setting
 from conformance.cli import main
+from conformance.compare import Comparisons, Deviation
 from conformance.errors import UserError
-from conformance.execute import run_check
+from conformance.execute import FailedCall, run_check
 from conformance.expected import ExpectedFailures, read_expected
+from conformance.judge import asking, judge_case
 from conformance.problems import make_problem, small_config, spaces
 from conformance.reports import values
 from conformance.reports.reproduce import snippet
 from conformance.results import misfit, read, schema, verdict
+from conformance.script import Script
 from spec import Discrete, Image, Spaces, Vector, load_config
 
 
@@ -130,7 +133,7 @@ def test_the_failing_call_is_the_smallest_case() -> None:
     source = (
         "import numpy as np\ndef symlog(x):\n    return np.where(np.abs(x) > 100, 0, np.sign(x) * np.log1p(np.abs(x)))"
     )
-    result = run_check(CHECKS[PASS], adapter(source), "float64", "paper", examples=100)
+    result = run_check(CHECKS[PASS], adapter(source), Setting("float64", "paper", examples=100))
     assert result.call is not None
     assert result.call.got is not None
     assert result.call.expected is not None
@@ -144,13 +147,20 @@ def test_a_candidate_that_writes_into_its_arguments_hides_nothing() -> None:
         x[...] = 7
         return x
 
-    run = Run(types.SimpleNamespace(symlog=careless), "float64", "paper")
-    run.call("symlog", np.array([1.0, 2.0]))
-    assert run.last_call is not None
-    assert run.last_call.arguments[0].tolist() == [1, 2]
+    adapter, comparisons = types.SimpleNamespace(symlog=careless), Comparisons("float64")
+    arguments = (np.array([1.0, 2.0]),)
+    judge_case(Case((Call("symlog", arguments),)), asking(adapter), comparisons)
+    assert arguments[0].tolist() == [1, 2]
+    kept = Case((Call("symlog", arguments),), keeps=True)
+    with pytest.raises(Deviation, match="the arguments of symlog after the call does not hold"):
+        judge_case(kept, asking(adapter), comparisons)
+    script = Script(Setting("float64", "paper"), asking(adapter), comparisons)
+    script.call("symlog", np.array([1.0, 2.0]))
+    assert comparisons.call is not None
+    assert comparisons.call.arguments[0].tolist() == [1, 2]
     large = np.zeros(2**17)  # of a full-size network in the preflight: not kept twice
-    run.call("symlog", large)
-    assert run.last_call.arguments[0] is large
+    script.call("symlog", large)
+    assert comparisons.call.arguments[0] is large
 
 
 def test_the_command_and_the_snippet_repeat_the_failure(
@@ -233,8 +243,8 @@ def test_large_arrays_show_the_worst_element_and_its_neighbours() -> None:
 
 def test_a_process_and_an_object_have_snippets() -> None:
     asked = settings(candidate="./their server", process=True)
-    assert "ProcessAdapter('./their server', 'float64'" in snippet(PASS, Call("symlog", (np.ones(2),)), asked)
-    made = snippet("replay.any", Call("Replay", (10, 2)), settings())
+    assert "ProcessAdapter('./their server', 'float64'" in snippet(PASS, FailedCall("symlog", (np.ones(2),)), asked)
+    made = snippet("replay.any", FailedCall("Replay", (10, 2)), settings())
     assert "judge(CHECKS['replay.any'], adapter, find_edition('paper'), 'float64', seed=3, examples=5)" in made
     assert "adapter.Replay" not in made
     compile(made, "snippet", "exec")
@@ -305,7 +315,7 @@ def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
 
 def test_a_requirement_passes_unexpectedly_only_as_a_whole() -> None:
     results = [
-        run_check(CHECKS[name], adapter(), "float64", "paper", examples=2)
+        run_check(CHECKS[name], adapter(), Setting("float64", "paper", examples=2))
         for name in (FAIL, "returns.lambda_return_matches", PASS)
     ]
     assert ExpectedFailures({"RET-1": "x"}).outcome("RET-1", results) == "fail"
@@ -334,7 +344,7 @@ class Listening:
 def test_the_same_seed_gives_the_same_cases() -> None:
     def heard(seed: int) -> list[bytes]:
         listening = Listening()
-        assert run_check(CHECKS[PASS], listening, "float64", "paper", seed, examples=10).status == "pass"
+        assert run_check(CHECKS[PASS], listening, Setting("float64", "paper", seed, examples=10)).status == "pass"
         return listening.heard
 
     assert heard(1) == heard(1)

@@ -13,6 +13,7 @@ from html_document import Document
 from report_data import ABSENT, CHECKS, ERROR, FAIL, HOSTILE, PASS, adapter, make
 from rich.console import Console
 
+from conformance.case import Setting
 from conformance.cli import main
 from conformance.execute import run_check
 from conformance.offered import offered, unchecked
@@ -261,7 +262,7 @@ def test_a_traceback_comes_last_and_folded(data: dict[str, Any]) -> None:
 def test_offered_but_not_checked() -> None:
     made = adapter("def mse_loss(prediction, target): ...\ndef symlog(x): return x")
     results = [
-        run_check(CHECKS[name], made, "float64", "paper", examples=1)
+        run_check(CHECKS[name], made, Setting("float64", "paper", examples=1))
         for name in ("distributions.squared_errors_match", PASS)
     ]
     assert offered(made) == ["symlog", "mse_loss"]

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from conformance.adapter import CONFIG_FIELDS, INTERFACE, load_adapter
+from conformance.case import Setting
 from conformance.cli import main
 from conformance.execute import run_check, selected_checks
 from conformance.problems import small_config
@@ -68,7 +69,7 @@ def test_the_skeleton_names_what_a_function_reads_of_the_configuration(monkeypat
     monkeypatch.setattr(Config, "__getattribute__", noted)
     for check in selected_checks("float64"):
         if set(check.uses) & set(CONFIG_FIELDS):
-            run_check(check, Noting(), "float64", "paper", examples=1, shrink=False)
+            run_check(check, Noting(), Setting("float64", "paper", examples=1), shrink=False)
     for name, fields in CONFIG_FIELDS.items():
         assert set(fields) <= reads[name], name
         assert reads[name] - set(fields) <= SIZES | {"discount_horizon"}, name

@@ -10,6 +10,7 @@ import pytest
 
 from conformance import statistics
 from conformance.adapters.numpy_adapter import NumpyAdapter
+from conformance.case import Setting
 from conformance.cases import sampling
 from conformance.execute import run_check, selected_checks
 from conformance.statistics import (
@@ -28,7 +29,7 @@ CHECKS = {check.name.partition(".")[2]: check for check in selected_checks("floa
 
 
 def status(name: str, adapter: object, seed: int = 0) -> tuple[str, str]:
-    result = run_check(CHECKS[name], adapter, "float64", "paper", seed)
+    result = run_check(CHECKS[name], adapter, Setting("float64", "paper", seed))
     return result.status, result.message
 
 

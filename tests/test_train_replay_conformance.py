@@ -5,6 +5,7 @@ import functools
 import pytest
 
 from conformance.adapters.numpy_adapter import NumpyAdapter
+from conformance.case import Setting
 from conformance.check import Check
 from conformance.execute import run_check, selected_checks
 from dreamer_spec.replay import Replay
@@ -25,7 +26,7 @@ class AsConfigured(NumpyAdapter):
 @pytest.mark.parametrize("adapter", [WithThisBuffer(), AsConfigured()], ids=["small chunks", "default chunks"])
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.name)
 def test_the_buffer_passes(check: Check, adapter: NumpyAdapter) -> None:
-    result = run_check(check, adapter, "float64", "paper", examples=10)
+    result = run_check(check, adapter, Setting("float64", "paper", examples=10))
     assert result.status == "pass", result.message
 
 
