@@ -1,13 +1,16 @@
-"""Checks of spec/10-agent.md: whole losses, their gradients, and whole training steps on small problems."""
+"""Checks of spec/10-agent.md: training steps, the policy step and initialization. Whole losses: cases/losses.py."""
 
 import dataclasses
 import functools
 import math
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 
-from conformance.check import Run, check
+from conformance.case import Cases, Equal, Setting, equal, exactly, judged, refused, related
+from conformance.check import check, script
+from conformance.compare import Comparisons, part_of
 from conformance.problems import (
     Problem,
     action_noise,
@@ -21,8 +24,9 @@ from conformance.problems import (
     uniforms,
     with_sampling_margin,
 )
+from conformance.script import Script
 from reference_numpy import agent as reference
-from spec import Discrete, Image, Spaces, load_config, parameter_table
+from spec import Discrete, Image, Parameter, Spaces, load_config, parameter_table
 
 # Vectors, images and both; discrete, continuous and mixed actions.
 COMBINATIONS = (
@@ -47,11 +51,10 @@ GROUPS = {
 }
 
 
-def bound_of(run: Run, double: float, single: float) -> float:
-    return double if run.dtype == "float64" else single
+def bound_of(setting: Setting, double: float, single: float) -> float:
+    return double if setting.dtype == "float64" else single
 
 
-@functools.lru_cache(maxsize=64)
 def safe_problem(seed: int, profile: str, observation: str, action: str, dtype: str) -> Problem:
     """A problem in which honest rounding moves no sample into another class, and free nats clip some time steps and not
     others."""
@@ -68,54 +71,50 @@ def clips_some(problem: Problem) -> bool:
     return clipped_mean > problem.config.free_nats + 0.1 and clipped_mean > mean + 0.01
 
 
-def problem_of(run: Run, observation: str, action: str) -> Problem:
-    return safe_problem(run.seed, run.profile, observation, action, run.dtype)
+class Example:
+    """A problem of `safe_problem` and what the reference makes of it, each computed once, when it is first asked for.
+
+    losses: the total and the aux. directions: see `unit_directions`. derivatives: of every loss along them.
+    """
+
+    def __init__(self, seed: int, profile: str, observation: str, action: str, dtype: str) -> None:
+        self.seed = seed
+        self.problem = safe_problem(seed, profile, observation, action, dtype)
+
+    @functools.cached_property
+    def losses(self) -> tuple[float, dict[str, Any]]:
+        return reference.losses(*self.problem.loss_arguments)
+
+    @functools.cached_property
+    def directions(self) -> dict[str, dict[str, np.ndarray]]:
+        return unit_directions(self.problem, self.seed)
+
+    @functools.cached_property
+    def derivatives(self) -> dict[str, np.ndarray]:
+        def means(params: Any) -> np.ndarray:
+            losses = reference.losses(params, *self.problem.loss_arguments[1:])[1]["losses"]
+            return np.array(list(losses.values()))
+
+        params = self.problem.state["params"]
+        columns = [reference.directional_derivative(means, params, along, 1e-5) for along in self.directions.values()]
+        return dict(zip(self.losses[1]["losses"], np.array(columns).T, strict=True))
+
+    @property
+    def total_derivatives(self) -> np.ndarray:
+        """The weighted sum of the derivatives."""
+        weights = {name: getattr(self.problem.config, f"{name.split('/')[0]}_scale") for name in self.derivatives}
+        return np.sum([weights[name] * value for name, value in self.derivatives.items()], 0)
 
 
-LOSS_REQUIREMENTS = (
-    *(f"AGT-{n}" for n in range(14, 28)),
-    *("RET-3", "RET-4", "RET-5", "RET-6", "RET-11", "RET-15", "BEH-11", "BEH-16", "BEH-17", "BEH-18"),
-    *("RSSM-20", "RSSM-22", "NET-1", "WM-1", "WM-6", "WM-9", "WM-15", "WM-16"),
-    *("CON-1", "CON-2", "CON-3", "CON-4", "CON-13", "CON-20", "CON-23", "CON-24"),
-)
+_example = functools.lru_cache(maxsize=64)(Example)
 
 
-@check(*LOSS_REQUIREMENTS, uses=["losses"], level=2, dtypes=WHOLE)
-def losses_match(run: Run) -> None:
-    """Every loss, the total, the return range, the latents and the metrics of one pass."""
-    for observation, action in COMBINATIONS:
-        problem = problem_of(run, observation, action)
-        total, aux = reference.losses(*problem.loss_arguments)
-        actual_total, actual = run.call("losses", *problem.loss_arguments)
-        where, bound = f"{observation}, {action}: ", bound_of(run, 1e-9, 2e-4)
-        run.compare(where + "losses", actual["losses"], aux["losses"], magnitude=loss_magnitude(aux), bound=bound)
-        run.compare(where + "total", actual_total, total, magnitude=abs(total), bound=bound)
-        run.compare(
-            where + "return_range", tuple(actual["return_range"]), aux["return_range"], magnitude=1.0, bound=bound
-        )
-        run.compare(where + "deter", actual["deter"], aux["deter"], magnitude=1.0, bound=bound)
-        run.exact(where + "stoch", np.round(actual["stoch"], 3), aux["stoch"].round(3))
-        metrics = {name: actual["metrics"][name] for name in aux["metrics"]}
-        run.compare(where + "metrics", metrics, aux["metrics"], magnitude=loss_magnitude(aux), bound=bound)
+def example_of(setting: Setting, observation: str, action: str) -> Example:
+    return _example(setting.seed, setting.profile, observation, action, setting.dtype)
 
 
-@check("AGT-25", "AGT-26", "RET-9", uses=["losses"], level=2, dtypes=WHOLE)
-def losses_of_short_sequences_match(run: Run) -> None:
-    """Two steps have one replayed value to learn; one step has none, and its loss is 0."""
-    for length in (2, 1):
-
-        def draw(attempt: int, length: int = length) -> Problem:
-            return make_problem(
-                1000 * run.seed + attempt, run.profile, "vector", "discrete", run.dtype, batch_length=length
-            )
-
-        problem = with_sampling_margin(draw, SAMPLING_MARGIN)
-        _, aux = reference.losses(*problem.loss_arguments)
-        _, actual = run.call("losses", *problem.loss_arguments)
-        bound = bound_of(run, 1e-9, 2e-4)
-        run.compare(f"{length} steps", actual["losses"], aux["losses"], magnitude=loss_magnitude(aux), bound=bound)
-        if length == 1:
-            run.exact("replayed value of one step", actual["losses"]["replay_critic"], 0.0)
+def problem_of(setting: Setting, observation: str, action: str) -> Problem:
+    return example_of(setting, observation, action).problem
 
 
 def loss_magnitude(aux: dict[str, Any]) -> float:
@@ -138,262 +137,225 @@ def unit_directions(problem: Problem, seed: int) -> dict[str, dict[str, np.ndarr
     return directions
 
 
-@functools.lru_cache(maxsize=64)
-def reference_derivatives(seed: int, profile: str, observation: str, action: str, dtype: str) -> dict[str, np.ndarray]:
-    problem = safe_problem(seed, profile, observation, action, dtype)
-    names = list(reference.losses(*problem.loss_arguments)[1]["losses"])
-
-    def means(params: Any) -> np.ndarray:
-        return np.array(list(reference.losses(params, *problem.loss_arguments[1:])[1]["losses"].values()))
-
-    directions = unit_directions(problem, seed).values()
-    columns = [
-        reference.directional_derivative(means, problem.state["params"], direction, 1e-5) for direction in directions
-    ]
-    return dict(zip(names, np.array(columns).T, strict=True))
+def latents_are(aux: dict[str, Any], where: str, bound: float) -> Iterator[Equal]:
+    """Demands of the latents in the second result of `losses` and train steps: `stoch` to three digits."""
+    yield Equal(aux["deter"], (1, "deter"), where=f"{where}deter", magnitude=1.0, bound=bound)
+    yield Equal(aux["stoch"].round(3), (1, "stoch"), where=f"{where}stoch", magnitude=1.0, bound=5e-4)
 
 
-# What reaches what: the table of [AGT-28].
-WORLD = {"encoder", "core", "posterior"}
-REACHES = {
-    "reconstruction": WORLD | {"decoder"},
-    "reward": WORLD | {"reward"},
-    "continue": WORLD | {"continue"},
-    "dynamics": WORLD | {"prior"},
-    "representation": WORLD,
-    "actor": {"actor"},
-    "critic": {"critic"},
-    "replay_critic": WORLD | {"critic"},
-}
-GRADIENT_REQUIREMENTS = (
-    *("AGT-28", "AGT-32", "CON-14", "CON-15", "RSSM-23", "RSSM-24", "RSSM-25", "NET-25"),
-    *("WM-1", "WM-11", "WM-12", "WM-13", "WM-14", "WM-17", "RET-18", "BEH-5", "BEH-10", "BEH-13", "BEH-15"),
-)
+@check("AGT-25", "AGT-26", "RET-9", uses=["losses"], level=2, dtypes=WHOLE)
+def losses_of_short_sequences_match(setting: Setting) -> Cases:
+    """Two steps have one replayed value to learn; one step has none, and its loss is 0."""
+    for length in (2, 1):
+
+        def draw(attempt: int, length: int = length) -> Problem:
+            seed = 1000 * setting.seed + attempt
+            return make_problem(seed, setting.profile, "vector", "discrete", setting.dtype, batch_length=length)
+
+        problem = with_sampling_margin(draw, SAMPLING_MARGIN)
+        _, aux = reference.losses(*problem.loss_arguments)
+        size, bound = loss_magnitude(aux), bound_of(setting, 1e-9, 2e-4)
+        demands = [Equal(aux["losses"], (1, "losses"), where=f"{length} steps", magnitude=size, bound=bound)]
+        if length == 1:
+            demands.append(exactly(0.0, (1, "losses", "replay_critic"), "replayed value of one step"))
+        yield judged("losses", problem.loss_arguments, *demands)
 
 
-@check(*GRADIENT_REQUIREMENTS, uses=["loss_derivatives"], level=2, dtypes=WHOLE)
-def loss_derivatives_match(run: Run) -> None:
-    """The derivative of every loss along random directions and within every group of parameters; where none may flow,
-    exactly 0."""
-    for observation, action in (("vector", "continuous"), ("both", "mixed")):
-        problem = problem_of(run, observation, action)
-        labels = list(unit_directions(problem, run.seed))
-        expected = reference_derivatives(run.seed, run.profile, observation, action, run.dtype)
-        actual = run.call(
-            "loss_derivatives", *problem.loss_arguments, list(unit_directions(problem, run.seed).values())
-        )
-        bound = bound_of(run, 1e-6, 5e-3)
-        for name, derivatives in expected.items():
-            where = f"{observation}, {action}: derivative of {name}"
-            # A derivative is a sum over parameters of both signs; central differences err by 1e-11 of the loss.
-            run.compare(where, actual[name], derivatives, magnitude=np.abs(derivatives).max() + 1e-3, bound=bound)
-            for label, value in zip(labels, np.asarray(actual[name]), strict=True):
-                reached = label not in GROUPS or label in REACHES[name.partition("/")[0]]
-                run.holds(f"{where} by the {label} parameters is {'not ' if reached else ''}0", (value != 0) == reached)
+def gradient_is_right(setting: Setting, observation: str, action: str) -> Callable[[Comparisons, Any], None]:
+    """The relation that the gradient of the total has to the derivatives of the losses along directions."""
+    example = example_of(setting, observation, action)
+    total = example.total_derivatives
+
+    def relation(c: Comparisons, gradients: Any) -> None:
+        products = [
+            sum(float((np.asarray(gradients[name]) * along).sum()) for name, along in direction.items())
+            for direction in example.directions.values()
+        ]
+        where, bound = f"{observation}, {action}: gradient along directions", bound_of(setting, 1e-6, 5e-3)
+        c.compare(where, np.array(products), total, magnitude=np.abs(total).max(), bound=bound)
+
+    return relation
 
 
 @check("AGT-32", uses=["gradients", "loss_derivatives"], level=2, dtypes=WHOLE)
-def total_gradient_is_the_weighted_sum(run: Run) -> None:
+def total_gradient_is_the_weighted_sum(setting: Setting) -> Cases:
     """The gradient of the total is the weighted sum of the gradients of the losses, for every parameter."""
     for observation, action in (("vector", "discrete"), ("both", "mixed")):
-        problem = problem_of(run, observation, action)
-        directions = unit_directions(problem, run.seed)
-        expected = reference_derivatives(run.seed, run.profile, observation, action, run.dtype)
-        weights = {name: getattr(problem.config, f"{name.split('/')[0]}_scale") for name in expected}
-        total = sum(weights[name] * value for name, value in expected.items())
-        gradients = run.call("gradients", *problem.loss_arguments)
-        run.holds("one gradient for each parameter", set(gradients) == set(problem.state["params"]))
-        products = [
-            sum(float((gradients[name] * d).sum()) for name, d in direction.items())
-            for direction in directions.values()
-        ]
-        where = f"{observation}, {action}: gradient along directions"
-        run.compare(where, np.array(products), total, magnitude=np.abs(total).max(), bound=bound_of(run, 1e-6, 5e-3))
+        problem = problem_of(setting, observation, action)
+
+        def complete(c: Comparisons, gradients: Any, params: Any = problem.state["params"]) -> None:
+            c.holds("one gradient for each parameter", set(gradients) == set(params))
+
+        yield judged("gradients", problem.loss_arguments, complete, gradient_is_right(setting, observation, action))
 
 
-def compare_steps(run: Run, where: str, actual: Any, expected: Any, state: Any, bound: float) -> None:
-    (new, aux), (expected_new, expected_aux) = actual, expected
-    run.exact(where + "step", new["optimizer"]["step"], expected_new["optimizer"]["step"])
+def step_is(setting: Setting, where: str, expected: Any, state: Any) -> Iterator[Equal]:
+    """Demands of what a train step returns: parameters and slow critic are right relative to how far they moved."""
+    bound = bound_of(setting, 1e-9, 2e-3)
+    new, aux = expected
+    yield exactly(new["optimizer"]["step"], (0, "optimizer", "step"), f"{where}step")
     for group in ("params", "slow_critic"):
-        for name, value in expected_new[group].items():
-            move = np.abs(value - state[group][name]).max() + run.u / bound * np.abs(value).max()
-            run.compare(f"{where}{group} {name}", new[group][name], value, magnitude=max(move, 1e-12), bound=bound)
+        moves = {
+            name: max(np.abs(value - state[group][name]).max() + setting.u / bound * np.abs(value).max(), 1e-12)
+            for name, value in new[group].items()
+        }
+        yield Equal(new[group], (0, group), where=f"{where}{group}", magnitude=moves, bound=bound)
     for moment in ("second_moment", "momentum"):
-        run.compare(
-            where + moment,
-            dict(new["optimizer"][moment]),
-            expected_new["optimizer"][moment],
-            magnitude="tensor",
-            bound=bound,
-        )
-    range_ = {name: float(value) for name, value in new["return_range"].items()}
-    run.compare(where + "return_range", range_, expected_new["return_range"], magnitude=1.0, bound=bound)
-    run.compare(
-        where + "losses", aux["losses"], expected_aux["losses"], magnitude=loss_magnitude(expected_aux), bound=bound
-    )
-    run.compare(where + "deter", aux["deter"], expected_aux["deter"], magnitude=1.0, bound=bound)
-    run.exact(where + "stoch", np.round(aux["stoch"], 3), expected_aux["stoch"].round(3))
+        at = (0, "optimizer", moment)
+        yield Equal(new["optimizer"][moment], at, where=where + moment, magnitude="tensor", bound=bound)
+    yield Equal(new["return_range"], (0, "return_range"), where=f"{where}return_range", magnitude=1.0, bound=bound)
+    losses, size = aux["losses"], loss_magnitude(aux)
+    yield Equal(losses, (1, "losses"), where=f"{where}losses", magnitude=size, bound=bound)
+    yield from latents_are(aux, where, bound)
 
 
-@check(
-    "AGT-29", "AGT-30", "BEH-21", "OPT-17", "OPT-21", "CON-22", uses=["train_step", "gradients"], level=3, dtypes=WHOLE
-)
-def train_step_matches(run: Run) -> None:
+def step_follows(setting: Setting, where: str, problem: Problem) -> Callable[[Comparisons, Any, Any], None]:
+    """The relation of a train step to the candidate's own gradients."""
+
+    def relation(c: Comparisons, gradients: Any, actual: Any) -> None:
+        inputs = (problem.state, problem.batch, problem.noise, gradients, problem.spaces, problem.config)
+        for demand in step_is(setting, where, reference.train_step(*inputs), problem.state):
+            how = {"magnitude": demand.magnitude, "bound": demand.bound}
+            c.compare(demand.where, part_of(actual, demand.at), demand.expected, **how)
+
+    return relation
+
+
+STEP = ("AGT-29", "AGT-30", "BEH-21", "OPT-17", "OPT-21")
+
+
+@check(*STEP, "CON-22", uses=["train_step", "gradients"], level=3, dtypes=WHOLE)
+def train_step_matches(setting: Setting) -> Cases:
     """Parameters, moments, slow critic, return range and latents after one step, for every kind of task."""
     for observation, action in COMBINATIONS:
-        problem = problem_of(run, observation, action)
-        gradients = run.call("gradients", *problem.loss_arguments)
-        arguments = (problem.batch, problem.noise)
-        expected = reference.train_step(problem.state, *arguments, gradients, problem.spaces, problem.config)
-        actual = run.call("train_step", problem.state, *arguments, problem.spaces, problem.config)
-        compare_steps(run, f"{observation}, {action}: ", actual, expected, problem.state, bound_of(run, 1e-9, 2e-3))
+        problem = problem_of(setting, observation, action)
+        inputs = (problem.state, problem.batch, problem.noise, problem.spaces, problem.config)
+        relation = step_follows(setting, f"{observation}, {action}: ", problem)
+        yield related(relation, ("gradients", problem.loss_arguments), ("train_step", inputs))
 
 
-@check(
-    "AGT-29",
-    "AGT-30",
-    "AGT-31",
-    "BEH-21",
-    "OPT-17",
-    "OPT-21",
-    "CON-22",
-    uses=["train_step_with"],
-    level=3,
-    dtypes=WHOLE,
-)
-def train_step_with_given_gradients_matches(run: Run) -> None:
+@check(*STEP, "AGT-31", "CON-22", uses=["train_step_with"], level=3, dtypes=WHOLE)
+def train_step_with_given_gradients_matches(setting: Setting) -> Cases:
     """The same with given gradients; the arguments are as before."""
-    problem = problem_of(run, "both", "mixed")
-    rng = run.rng()
+    problem, rng = problem_of(setting, "both", "mixed"), setting.rng()
     gradients = {name: rng.normal(size=value.shape) for name, value in problem.state["params"].items()}
-    before = {name: value.copy() for name, value in problem.state["params"].items()}
     arguments = (problem.state, problem.batch, problem.noise, gradients, problem.spaces, problem.config)
-    actual = run.call("train_step_with", *arguments)
-    compare_steps(run, "", actual, reference.train_step(*arguments), problem.state, bound_of(run, 1e-9, 2e-3))
-    for name, value in before.items():
-        run.exact(f"argument {name} after the step", problem.state["params"][name], value)
+    demands = step_is(setting, "", reference.train_step(*arguments), problem.state)
+    yield judged("train_step_with", arguments, *demands, keeps=True)
 
 
 @check("AGT-31", uses=["train_step"], level=3, dtypes=WHOLE)
-def train_step_keeps_its_arguments(run: Run) -> None:
+def train_step_keeps_its_arguments(setting: Setting) -> Cases:
     """State, batch and noise are the same arrays with the same numbers after a step."""
-    problem = problem_of(run, "both", "mixed")
-    arrays = {**problem.state["params"], **problem.batch, **problem.noise}
-    before = {name: np.array(value) for name, value in arrays.items()}
-    run.call("train_step", problem.state, problem.batch, problem.noise, problem.spaces, problem.config)
-    for name, value in before.items():
-        run.exact(name, arrays[name], value)
+    problem = problem_of(setting, "both", "mixed")
+    inputs = (problem.state, problem.batch, problem.noise, problem.spaces, problem.config)
+    yield judged("train_step", inputs, keeps=True)
 
 
-def policy_arguments(run: Run, rows: int = 4) -> tuple[Any, ...]:
-    rng, task = run.rng(), spaces()
-    config = small_config(run.profile, run.dtype)
-    params = random_parameters(rng, config, task, run.dtype)
+def policy_arguments(setting: Setting, rows: int = 4) -> tuple[Any, ...]:
+    rng, task = setting.rng(), spaces()
+    config = small_config(setting.profile, setting.dtype)
+    params = random_parameters(rng, config, task, setting.dtype)
     noise = {"posterior": uniforms(rng, rows, config.stoch), "action": action_noise(rng, task, (rows,))}
     observation = random_observations(rng, task, (rows,))
     is_first = np.arange(rows) % 2 == 1
-    return (
-        params,
-        random_carry(rng, config, (rows,)),
-        random_actions(rng, task, (rows,)),
-        observation,
-        is_first,
-        noise,
-        task,
-        config,
-    )
+    carry, prev_action = random_carry(rng, config, (rows,)), random_actions(rng, task, (rows,))
+    return params, carry, prev_action, observation, is_first, noise, task, config
 
 
 @check("AGT-11", "AGT-12", "BEH-8", "CON-26", "CON-27", uses=["policy_step"], level=1, dtypes=WHOLE)
-def policy_step_matches(run: Run) -> None:
+def policy_step_matches(setting: Setting) -> Cases:
     """Carry and sampled action of a few rows, some of them at a reset."""
-    arguments = policy_arguments(run)
-    carry, action = reference.policy_step(*arguments)
-    run.expect("policy_step", arguments, (carry, action), magnitude=1.0, bound=bound_of(run, 1e-10, 1e-4))
+    arguments, bound = policy_arguments(setting), bound_of(setting, 1e-10, 1e-4)
+    yield equal("policy_step", arguments, reference.policy_step(*arguments), magnitude=1.0, bound=bound)
 
 
 @check("AGT-13", "RSSM-13", "RSSM-14", "CON-12", uses=["policy_step"], level=1)
-def policy_step_resets_and_rows(run: Run) -> None:
+def policy_step_resets_and_rows(setting: Setting) -> Cases:
     """Where is_first, carry and previous action change nothing, not even as NaN; and rows do not influence each
     other."""
-    params, carry, prev_action, observation, is_first, noise, task, config = policy_arguments(run)
-    before = run.call("policy_step", params, carry, prev_action, observation, is_first, noise, task, config)
-    spoiled = {name: value.copy() for name, value in carry.items()}
-    spoiled["deter"][is_first] = spoiled["stoch"][is_first] = np.nan
-    spoiled_action = prev_action.copy()
-    spoiled_action[is_first] = np.nan
-    after = run.call("policy_step", params, spoiled, spoiled_action, observation, is_first, noise, task, config)
-    for name in ("deter", "stoch"):
-        run.exact(f"{name} after a reset", after[0][name], before[0][name])
-    run.exact("action after a reset", after[1], before[1])
+    params, carry, prev_action, observation, is_first, *rest = policy_arguments(setting)
+    spoiled, spoiled_action = {name: value.copy() for name, value in carry.items()}, prev_action.copy()
+    spoiled["deter"][is_first] = spoiled["stoch"][is_first] = spoiled_action[is_first] = np.nan
     other = {key: value.copy() for key, value in observation.items()}
     for value in other.values():
         value[0] = 0
-    changed = run.call("policy_step", params, carry, prev_action, other, is_first, noise, task, config)
-    run.exact("actions of the other rows", np.asarray(changed[1])[1:], np.asarray(before[1])[1:])
+
+    def same(c: Comparisons, before: Any, after: Any, changed: Any) -> None:
+        for name in ("deter", "stoch"):
+            c.exact(f"{name} after a reset", after[0][name], before[0][name])
+        c.exact("action after a reset", after[1], before[1])
+        c.exact("actions of the other rows", np.asarray(changed[1])[1:], np.asarray(before[1])[1:])
+
+    inputs = (carry, prev_action, observation), (spoiled, spoiled_action, observation), (carry, prev_action, other)
+    yield related(same, *(("policy_step", (params, *changing, is_first, *rest)) for changing in inputs))
+
+
+def drawn_for(setting: Setting, table: dict[str, Parameter]) -> dict[str, np.ndarray]:
+    """Uniform numbers for every entry of the table that is drawn."""
+    rng = setting.rng()
+    return {name: uniforms(rng, *entry.shape) for name, entry in table.items() if _is_drawn(entry)}
+
+
+def _is_drawn(entry: Parameter) -> bool:
+    return entry.initializer == "truncated_normal"
 
 
 @check("AGT-1", "AGT-3", "AGT-4", "AGT-5", "AGT-6", uses=["initial_parameters"], level=1)
-def initial_parameters_match(run: Run) -> None:
+def initial_parameters_match(setting: Setting) -> Cases:
     """Every tensor of the table from the same uniforms; biases 0, scales 1; the standard deviations follow fan-in and
     outscale."""
-    task, config = spaces(), load_config(run.profile, "tiny", units=64, compute_dtype=run.dtype)
-    table = parameter_table(config, task)
-    rng = run.rng()
-    drawn = {
-        name: uniforms(rng, *entry.shape) for name, entry in table.items() if entry.initializer == "truncated_normal"
-    }
-    expected = reference.initial_parameters(table, drawn)
-    actual = run.call("initial_parameters", table, drawn)
+    table = parameter_table(load_config(setting.profile, "tiny", units=64, compute_dtype=setting.dtype), spaces())
+    drawn = drawn_for(setting, table)
     scale = {name: entry.outscale / math.sqrt(entry.fan_in) for name, entry in table.items()}
-    bound = 1e-9 if run.dtype == "float64" else 3e-5
-    run.compare(
-        "initial_parameters",
-        actual,
-        expected,
-        magnitude={name: max(value, 1e-12) for name, value in scale.items()},
-        bound=bound,
-    )
-    for name, entry in table.items():
-        if entry.initializer == "truncated_normal" and entry.outscale > 0 and np.size(actual[name]) >= 4096:
-            run.compare(f"standard deviation of {name}", np.std(actual[name]), scale[name], bound=0.1)
+
+    def spread(c: Comparisons, actual: Any) -> None:
+        for name, entry in table.items():
+            if _is_drawn(entry) and entry.outscale > 0 and np.size(actual[name]) >= 4096:
+                c.compare(f"standard deviation of {name}", np.std(actual[name]), scale[name], bound=0.1)
+
+    magnitude = {name: max(value, 1e-12) for name, value in scale.items()}
+    bound = 1e-9 if setting.dtype == "float64" else 3e-5
+    expected = reference.initial_parameters(table, drawn)
+    yield judged("initial_parameters", (table, drawn), Equal(expected, magnitude=magnitude, bound=bound), spread)
 
 
 @check("AGT-7", "AGT-8", "OPT-13", uses=["initial_state"], level=1)
-def initial_state_matches(run: Run) -> None:
+def initial_state_matches(setting: Setting) -> Cases:
     """The slow critic is a copy of the critic, moments and return range are zero, the step is 0."""
-    params = random_parameters(run.rng(), small_config(run.profile, run.dtype), spaces(), run.dtype)
-    state = run.call("initial_state", params)
+    params = random_parameters(setting.rng(), small_config(setting.profile, setting.dtype), spaces(), setting.dtype)
     expected = reference.initial_state(params)
-    run.exact("step", state["optimizer"]["step"], 0)
-    for group in ("params", "slow_critic"):
-        run.compare(group, dict(state[group]), expected[group], bound=0 + run.u)
-    for moment in ("second_moment", "momentum"):
-        for name, value in expected["optimizer"][moment].items():
-            run.exact(f"{moment} {name}", state["optimizer"][moment][name], value)
-    run.exact("return_range", [state["return_range"]["low"], state["return_range"]["high"]], [0, 0])
+    yield judged(
+        "initial_state",
+        (params,),
+        exactly(0, ("optimizer", "step"), "step"),
+        *(Equal(expected[group], (group,), where=group, bound=setting.u) for group in ("params", "slow_critic")),
+        *(
+            exactly(expected["optimizer"][moment], ("optimizer", moment), moment)
+            for moment in ("second_moment", "momentum")
+        ),
+        exactly({"low": 0.0, "high": 0.0}, ("return_range",), "return_range"),
+    )
 
 
-@check("AGT-6", "NET-20", uses=["initial_parameters", "losses"], level=2, dtypes=WHOLE)
-def a_fresh_agent_predicts_zero(run: Run) -> None:
+@script("AGT-6", "NET-20", uses=["initial_parameters", "losses"], level=2, dtypes=WHOLE)
+def a_fresh_agent_predicts_zero(script: Script) -> None:
     """Rewards and values of a fresh agent are exactly 0, and each cross-entropy is ln of the number of bins."""
-    problem = problem_of(run, "vector", "discrete")
+    problem = problem_of(script.setting, "vector", "discrete")
     table = parameter_table(problem.config, problem.spaces)
-    rng = run.rng()
-    drawn = {
-        name: uniforms(rng, *entry.shape) for name, entry in table.items() if entry.initializer == "truncated_normal"
-    }
-    params = run.call("initial_parameters", table, drawn)
+    params = script.call("initial_parameters", table, drawn_for(script.setting, table))
     slow = {name: value for name, value in params.items() if name.startswith("critic/")}
-    _, aux = run.call("losses", params, slow, (0.0, 0.0), problem.batch, problem.noise, problem.spaces, problem.config)
+    arguments = (params, slow, (0.0, 0.0), problem.batch, problem.noise, problem.spaces, problem.config)
+    _, aux = script.call("losses", *arguments)
     for name in ("reward_mean", "value_mean", "return_mean"):
-        run.exact(name, aux["metrics"][name], 0.0)
-    run.compare("reward loss", aux["losses"]["reward"], math.log(problem.config.bins), bound=16 * run.u)
+        script.exact(name, aux["metrics"][name], 0.0)
+    bound = 16 * script.setting.u
+    script.compare("reward loss", aux["losses"]["reward"], math.log(problem.config.bins), bound=bound)
 
 
 @check("AGT-2", "NET-12", uses=["encoder"], level=1)
-def images_of_other_sizes_are_refused(run: Run) -> None:
+def images_of_other_sizes_are_refused(setting: Setting) -> Cases:
     """Sides that the encoder cannot halve are refused."""
     task = Spaces({"image": Image(24, 20, 3)}, {"action": Discrete((2,))})
-    config = small_config(run.profile, run.dtype)
-    run.refuses("encoder", {}, {"image": np.zeros((1, 24, 20, 3), np.uint8)}, task, config)
+    config = small_config(setting.profile, setting.dtype)
+    yield refused("encoder", {}, {"image": np.zeros((1, 24, 20, 3), np.uint8)}, task, config)
