@@ -8,8 +8,10 @@ from typing import Any
 import hypothesis.strategies as st
 import numpy as np
 
+from conformance.case import Cases, Drawn, Equal, Setting, equal, exact, exactly, judged, refused, related
 from conformance.cases.agent import SAMPLING_MARGIN, WHOLE, bound_of, problem_of, unit_directions
-from conformance.check import Run, check, round_to
+from conformance.check import check
+from conformance.compare import Comparisons, round_to
 from conformance.problems import (
     Problem,
     make_problem,
@@ -29,166 +31,172 @@ from spec import Config, Discrete, Image, Spaces, Vector, parameter_table
 
 ACTIONS: dict[str, Vector | Discrete] = {"turn": Vector(2)}
 TASK = Spaces({"position": Vector(3), "mode": Discrete((2, 3)), "image": Image(4, 6, 3)}, ACTIONS)
-SURE = math.log(
-    3.0
-)  # logits (0, ln 3) and a mixture of one percent: 0.128082 nats from the uniform distribution, 0.140535 nats to it
+# Logits (0, ln 3) and a mixture of one percent: 0.128082 nats from the uniform distribution, 0.140535 nats to it.
+SURE = math.log(3.0)
+BEHAVIOR = ("actor", "critic", "replay_critic")  # losses of another chapter
 WEIGHTS = {
     f"{name}_scale": weight
     for name, weight in (("reconstruction", 2.0), ("reward", 3.0), ("continue", 5.0), ("dynamics", 7.0))
 }
 
 
-def held(run: Run, x: Any) -> np.ndarray:
+def held(setting: Setting, x: Any) -> np.ndarray:
     """Losses read numbers of float32 or better in every compute dtype."""
-    return round_to(x, "float64" if run.dtype == "float64" else "float32")
+    return round_to(x, "float64" if setting.dtype == "float64" else "float32")
 
 
 @check("WM-7", "CON-11", uses=["continue_target"], level=0)
-def continue_target_literals(run: Run) -> None:
+def continue_target_literals(setting: Setting) -> Cases:
     """0 at terminations; elsewhere 1, or 332/333 for the discounted target; any shape."""
     is_terminal = np.array([[False, True, False], [True, False, False]])
-    hard, soft = (small_config(run.profile, run.dtype, continue_target=kind) for kind in ("hard", "discounted"))
-    run.exact("hard", run.call("continue_target", is_terminal, hard), np.array([[1.0, 0, 1], [0, 1, 1]]))
-    run.expect(
-        "continue_target", (is_terminal, soft), np.array([[1.0, 0, 1], [0, 1, 1]]) * (332 / 333), bound=4 * run.u
-    )
+    hard, soft = (small_config(setting.profile, setting.dtype, continue_target=kind) for kind in ("hard", "discounted"))
+    target = np.array([[1.0, 0, 1], [0, 1, 1]])
+    yield exact("continue_target", (is_terminal, hard), target, where="hard")
+    yield equal("continue_target", (is_terminal, soft), target * (332 / 333), bound=4 * setting.u)
     other = dataclasses.replace(soft, discount_horizon=4.0)
-    run.exact("discount 3/4", run.call("continue_target", is_terminal[0], other), np.array([0.75, 0, 0.75]))
+    yield exact("continue_target", (is_terminal[0], other), np.array([0.75, 0, 0.75]), where="discount 3/4")
 
 
 @check("WM-10", "WM-11", "WM-14", "RSSM-10", uses=["kl_losses"], level=0)
-def kl_literals(run: Run) -> None:
+def kl_literals(setting: Setting) -> Cases:
     """2, 7, 8 and 10 latents of 0.128082 nats give 1, 1, 1.024657 and 1.280821: sum, then clip, for each row by
     itself."""
-    config = small_config(run.profile, run.dtype, stoch=10, classes=2, latent_unimix=0.01, free_nats=1.0)
+    config = small_config(setting.profile, setting.dtype, stoch=10, classes=2, latent_unimix=0.01, free_nats=1.0)
     sure, zeros = np.zeros((5, 10, 2)), np.zeros((5, 10, 2))
     for row, latents in enumerate((2, 7, 8, 10, 10)):
         sure[row, :latents, 1] = SURE
-    sure = held(run, sure)
+    sure = held(setting, sure)
     posterior, prior = np.concatenate([sure[:4], zeros[:1]]), np.concatenate([zeros[:4], sure[4:]])
     expected = np.array([1, 1, 1.024657082, 1.280821352, 1.40535321])  # in the last row the prior is the sure one
-    bound = 1e-8 if run.dtype == "float64" else 64 * run.u
-    run.expect("kl_losses", (posterior, prior, config), (expected, expected), bound=bound)
+    bound = 1e-8 if setting.dtype == "float64" else 64 * setting.u
+    yield equal("kl_losses", (posterior, prior, config), (expected, expected), bound=bound)
     lower = dataclasses.replace(config, free_nats=0.3)
     expected = np.array([0.3, 0.896574946, 1.024657082, 1.280821352, 1.40535321])
-    run.expect("kl_losses", (posterior, prior, lower), (expected, expected), bound=bound)
+    yield equal("kl_losses", (posterior, prior, lower), (expected, expected), bound=bound)
 
 
 @check("WM-10", "RSSM-10", uses=["kl_losses"], level=0)
-def kl_is_bounded(run: Run) -> None:
+def kl_is_bounded(setting: Setting) -> Cases:
     """32 latents of 64 classes that are sure of different classes are 277.331813 nats apart: the mixture is in both
     distributions."""
-    config = small_config(run.profile, run.dtype, stoch=32, classes=64, latent_unimix=0.01)
+    config = small_config(setting.profile, setting.dtype, stoch=32, classes=64, latent_unimix=0.01)
     first, last = np.full((1, 32, 64), -1e4), np.full((1, 32, 64), -1e4)
     first[..., 0] = last[..., -1] = 1e4
     expected = np.array([277.331813])
-    bound = 1e-8 if run.dtype == "float64" else 64 * run.u
-    run.expect("kl_losses", (first, last, config), (expected, expected), bound=bound)
+    bound = 1e-8 if setting.dtype == "float64" else 64 * setting.u
+    yield equal("kl_losses", (first, last, config), (expected, expected), bound=bound)
     half = np.zeros((1, 32, 64))
-    half[..., 0] = math.log(
-        63
-    )  # without mixture the probabilities are 1/2 and 63 times 1/126, here compared with 64 times 1/64
+    # Without mixture the probabilities are 1/2 and 63 times 1/126, here compared with 64 times 1/64.
+    half[..., 0] = math.log(63)
     expected = np.array([32 * (math.log(64 / 2) + math.log(64 / 126)) / 2])
     plain = dataclasses.replace(config, latent_unimix=0.0)
-    run.expect("kl_losses", (held(run, half), np.zeros((1, 32, 64)), plain), (expected, expected), bound=bound)
+    yield equal("kl_losses", (held(setting, half), np.zeros((1, 32, 64)), plain), (expected, expected), bound=bound)
 
 
 @check("WM-10", "WM-11", "WM-14", "WM-18", uses=["kl_losses"], level=0)
-def kl_matches(run: Run) -> None:
+def kl_matches(setting: Setting) -> Cases:
     """Random logits from almost uniform to almost sure, with several floors; both results are the same number."""
     options = [{}, {"free_nats": 0.0}, {"free_nats": 3.0, "latent_unimix": 0.3}]
 
-    @run.for_all(seed=seeds(), overrides=st.sampled_from(options), scale=st.sampled_from([0.1, 1.0, 10.0, 1e3]))
-    def _(seed: int, overrides: dict[str, Any], scale: float) -> None:
-        config = small_config(run.profile, run.dtype, **overrides)
-        posterior, prior = (
-            held(run, normals(seed + i, 2, 4, config.stoch, config.classes, scale=scale)) for i in (0, 1)
-        )
+    def case(seed: int, overrides: dict[str, Any], scale: float) -> Cases:
+        config = small_config(setting.profile, setting.dtype, **overrides)
+        shape = 2, 4, config.stoch, config.classes
+        posterior, prior = (held(setting, normals(seed + i, *shape, scale=scale)) for i in (0, 1))
         log_q, log_p = (unimix_log_probs(logits, config.latent_unimix) for logits in (posterior, prior))
         magnitude = 1 + (np.exp(log_q) * (np.abs(log_q) + np.abs(log_p))).sum((-2, -1))
-        expected = reference.kl_losses(posterior, prior, config)
-        run.expect(
-            "kl_losses", (posterior, prior, config), expected, magnitude=(magnitude, magnitude), bound=64 * run.u
-        )
+        arguments = posterior, prior, config
+        expected = reference.kl_losses(*arguments)
+        yield equal("kl_losses", arguments, expected, magnitude=(magnitude, magnitude), bound=64 * setting.u)
+
+    yield Drawn(case, seed=seeds(), overrides=st.sampled_from(options), scale=st.sampled_from([0.1, 1.0, 10.0, 1e3]))
 
 
 @check("WM-14", "WM-18", uses=["kl_losses"], level=0)
-def kl_extremes(run: Run) -> None:
+def kl_extremes(setting: Setting) -> Cases:
     """Equal distributions are 0 nats apart and never less; a NaN shows in its own element, and no other."""
-    config = small_config(run.profile, run.dtype)
+    config = small_config(setting.profile, setting.dtype)
     free = dataclasses.replace(config, free_nats=0.0)
-    logits = held(run, normals(run.seed, 4, config.stoch, config.classes, scale=2.0))
-    for name, loss in zip(("dynamics", "representation"), run.call("kl_losses", logits, logits, free), strict=True):
-        run.compare(f"{name} of equal distributions", loss, np.zeros(4), magnitude=1.0, bound=64 * run.u)
-        run.holds(f"{name} is not negative", np.asarray(loss) >= 0)
-    for argument in (0, 1):
-        arguments = [logits.copy(), np.zeros_like(logits)]
-        before = run.call("kl_losses", *arguments, config)
-        arguments[argument][1, 2, 0] = np.nan
-        with np.errstate(invalid="ignore"):
-            after = run.call("kl_losses", *arguments, config)
+    logits = held(setting, normals(setting.seed, 4, config.stoch, config.classes, scale=2.0))
+
+    def not_negative(c: Comparisons, losses: Any) -> None:
+        for name, loss in zip(("dynamics", "representation"), losses, strict=True):
+            c.holds(f"{name} is not negative", np.asarray(loss) >= 0)
+
+    where, zeros = "losses of equal distributions", (np.zeros(4), np.zeros(4))
+    golden = Equal(zeros, where=where, magnitude=1.0, bound=64 * setting.u)
+    yield judged("kl_losses", (logits, logits, free), golden, not_negative)
+
+    def shows(c: Comparisons, before: Any, after: Any) -> None:
         for name, clean, loss in zip(("dynamics", "representation"), before, after, strict=True):
-            run.exact(f"{name} with a NaN", loss, np.where(np.arange(4) == 1, np.nan, clean))
+            c.exact(f"{name} with a NaN", loss, np.where(np.arange(4) == 1, np.nan, clean))
+
+    for argument in (0, 1):
+        clean = [logits, np.zeros_like(logits)]
+        spoiled = [x.copy() for x in clean]
+        spoiled[argument][1, 2, 0] = np.nan
+        yield related(shows, ("kl_losses", (*clean, config)), ("kl_losses", (*spoiled, config)))
 
 
 @check("WM-2", "WM-3", "WM-4", "WM-5", uses=["reconstruction_losses"], level=0)
-def reconstruction_literals(run: Run) -> None:
+def reconstruction_literals(setting: Setting) -> Cases:
     """Vector 10 at 1 costs 1.954111 times the scale; Discrete((2, 3)) at (0, 2) ln 4 + ln 3, whatever the scale; a
     pixel 0.25."""
     task = Spaces({"x": Vector(2), "kind": Discrete((2, 3)), "view": Image(2, 2, 1)}, ACTIONS)
-    kind = held(run, [[0.0, SURE, 0.0, 0.0, 0.0]])
+    kind = held(setting, [[0.0, SURE, 0.0, 0.0, 0.0]])
     predictions = {"x": np.array([[1.0, 0.0]]), "kind": kind, "view": np.full((1, 2, 2, 1), 0.5)}
     view = np.array([[255, 0], [0, 51]], np.uint8).reshape(1, 2, 2, 1)
     observations = {"x": np.array([[10, 0]], np.float32), "kind": np.array([[0, 2]]), "view": view}
     for scale in (0.5, 1.0):
-        config = small_config(run.profile, run.dtype, vector_loss_scale=scale)
-        expected = {"x": [1.954111 * scale], "kind": [2.4849066498], "view": [0.75 + 0.09]}
-        expected_arrays = {key: np.array(value) for key, value in expected.items()}
-        run.expect(
-            "reconstruction_losses", (predictions, observations, task, config), expected_arrays, bound=1e-6 + 16 * run.u
-        )
+        config = small_config(setting.profile, setting.dtype, vector_loss_scale=scale)
+        expected = {
+            "x": np.array([1.954111 * scale]),
+            "kind": np.array([2.4849066498]),
+            "view": np.array([0.75 + 0.09]),
+        }
+        arguments = predictions, observations, task, config
+        yield equal("reconstruction_losses", arguments, expected, bound=1e-6 + 16 * setting.u)
 
 
 @check("WM-2", "WM-3", "WM-4", "WM-5", "WM-18", "CON-24", uses=["reconstruction_losses"], level=0)
-def reconstruction_matches(run: Run) -> None:
+def reconstruction_matches(setting: Setting) -> Cases:
     """Random predictions and observations of any scale, two leading axes; one loss for each key, with predictions in
     float32 or better."""
-    config = small_config(run.profile, run.dtype)
+    config = small_config(setting.profile, setting.dtype)
 
-    @run.for_all(
-        seed=seeds(),
-        position=arrays(adversarial_numbers(finite=True), (2, 3, 3)),
-        scale=st.sampled_from([0.1, 3.0, 100.0]),
-    )
-    def _(seed: int, position: np.ndarray, scale: float) -> None:
-        observations = random_observations(np.random.default_rng(seed), TASK, (2, 3)) | {
-            "position": position.astype(np.float32)
-        }
+    def case(seed: int, position: np.ndarray, scale: float) -> Cases:
+        observations = random_observations(np.random.default_rng(seed), TASK, (2, 3))
+        observations["position"] = position.astype(np.float32)
         brightness = np.random.default_rng(seed + 3).random((2, 3, 4, 6, 3))
         drawn = {
             "position": normals(seed, 2, 3, 3, scale=scale),
             "mode": normals(seed + 1, 2, 3, 5, scale=scale),
             "image": brightness,
         }
-        predictions = {key: held(run, value) for key, value in drawn.items()}
+        predictions = {key: held(setting, value) for key, value in drawn.items()}
+        distance = np.abs(predictions["position"]) + np.log1p(np.abs(observations["position"].astype(float)))
         magnitude = {
-            "position": (
-                (np.abs(predictions["position"]) + np.log1p(np.abs(observations["position"].astype(float)))) ** 2
-            ).sum(-1),
+            "position": (distance**2).sum(-1),
             "mode": 2 + 2 * np.abs(predictions["mode"]).max(-1),
             "image": ((brightness + observations["image"] / 255.0) ** 2).sum((-3, -2, -1)),
         }
         others = {"reward": np.full((2, 3), np.nan), **observations}
         expected = reference.reconstruction_losses(predictions, observations, TASK, config)
         arguments = predictions, others, TASK, config
-        run.expect("reconstruction_losses", arguments, expected, magnitude=magnitude, bound=64 * run.u)
+        yield equal("reconstruction_losses", arguments, expected, magnitude=magnitude, bound=64 * setting.u)
+
+    yield Drawn(
+        case,
+        seed=seeds(),
+        position=arrays(adversarial_numbers(finite=True), (2, 3, 3)),
+        scale=st.sampled_from([0.1, 3.0, 100.0]),
+    )
 
 
 @check("WM-18", uses=["reconstruction_losses"], level=0)
-def reconstruction_shows_nan(run: Run) -> None:
+def reconstruction_shows_nan(setting: Setting) -> Cases:
     """A NaN in a prediction or an observation shows in the loss of its own key and step, and no other."""
-    config = small_config(run.profile, run.dtype)
-    observations = random_observations(run.rng(), TASK, (3,))
+    config = small_config(setting.profile, setting.dtype)
+    observations = random_observations(setting.rng(), TASK, (3,))
     predictions = {"position": np.zeros((3, 3)), "mode": np.zeros((3, 5)), "image": np.zeros((3, 4, 6, 3))}
     expected = reference.reconstruction_losses(predictions, observations, TASK, config)
     for mapping, key in ((predictions, "image"), (predictions, "mode"), (observations, "position")):
@@ -196,55 +204,43 @@ def reconstruction_shows_nan(run: Run) -> None:
         spoiled.reshape(3, -1)[1, 1] = np.nan
         arguments = [mapping | {key: spoiled} if x is mapping else x for x in (predictions, observations)]
         wanted = expected | {key: np.where(np.arange(3) == 1, np.nan, expected[key])}
-        run.expect("reconstruction_losses", (*arguments, TASK, config), wanted, bound=256 * run.u)
+        yield equal("reconstruction_losses", (*arguments, TASK, config), wanted, bound=256 * setting.u)
 
 
 @check("WM-19", "WM-3", "WM-4", "NET-4", "NET-6", "CON-8", uses=["reconstruction_losses"], level=0)
-def reconstruction_refuses(run: Run) -> None:
+def reconstruction_refuses(setting: Setting) -> Cases:
     """Missing keys, shapes that do not fit, real numbers for a Discrete and anything but uint8 for an Image are
     refused."""
-    config = small_config(run.profile, run.dtype)
-    observations = random_observations(run.rng(), TASK, (3,))
+    config = small_config(setting.profile, setting.dtype)
+    observations = random_observations(setting.rng(), TASK, (3,))
     predictions = {"position": np.zeros((3, 3)), "mode": np.zeros((3, 5)), "image": np.zeros((3, 4, 6, 3))}
-
-    def pair(
-        changed: dict[str, np.ndarray], is_predictions: bool
-    ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-        return (changed, observations) if is_predictions else (predictions, changed)
-
     for key in TASK.observations:
-        for mapping in (predictions, observations):
-            missing = {name: value for name, value in mapping.items() if name != key}
-            for changed in (missing, missing | {key: mapping[key][..., :-1]}):
-                run.refuses("reconstruction_losses", *pair(changed, mapping is predictions), TASK, config, naming=[key])
-            for rows in (mapping[key][:1], mapping[key][0]):
-                run.refuses("reconstruction_losses", *pair(missing | {key: rows}, mapping is predictions), TASK, config)
+        for index, mapping in enumerate((predictions, observations)):
+            missing, value = {name: x for name, x in mapping.items() if name != key}, mapping[key]
+            resized = [missing | {key: x} for x in (value[..., :-1], value[:1], value[0])]
+            for changed, naming in zip([missing, *resized], ([key], [key], [], []), strict=True):
+                pair = (predictions, changed) if index else (changed, observations)
+                yield refused("reconstruction_losses", *pair, TASK, config, naming=naming)
     for key, real in (("mode", np.float32), ("image", np.float32), ("image", np.int64)):
-        run.refuses(
-            "reconstruction_losses",
-            predictions,
-            observations | {key: observations[key].astype(real)},
-            TASK,
-            config,
-            naming=[key],
-        )
+        changed = observations | {key: observations[key].astype(real)}
+        yield refused("reconstruction_losses", predictions, changed, TASK, config, naming=[key])
 
 
 @check("WM-19", "CON-8", uses=["kl_losses"], level=0)
-def kl_refuses(run: Run) -> None:
+def kl_refuses(setting: Setting) -> Cases:
     """Logits of another shape than [..., stoch, classes], and two shapes that could be broadcast, are refused."""
-    config = small_config(run.profile, run.dtype)
+    config = small_config(setting.profile, setting.dtype)
     S, C = config.stoch, config.classes
     for wrong in ((4, S * C), (4, C, S), (4, S, C - 1), (4, S, 1), (4, 1, C), (1, S, C), (S, C), (5, S, C)):
-        run.refuses("kl_losses", np.zeros(wrong), np.zeros((4, S, C)), config)
-        run.refuses("kl_losses", np.zeros((4, S, C)), np.zeros(wrong), config)
+        yield refused("kl_losses", np.zeros(wrong), np.zeros((4, S, C)), config)
+        yield refused("kl_losses", np.zeros((4, S, C)), np.zeros(wrong), config)
 
 
-def constant_heads(run: Run, continue_logit: float) -> tuple[Problem, dict[str, np.ndarray]]:
+def constant_heads(setting: Setting, continue_logit: float) -> tuple[Problem, dict[str, np.ndarray]]:
     """A problem whose weights are all zero, so that every prediction is the bias of its output layer, and these
     biases."""
-    problem = make_problem(run.seed, run.profile, "both", "mixed", run.dtype, **WEIGHTS)
-    rng = run.rng()
+    problem = make_problem(setting.seed, setting.profile, "both", "mixed", setting.dtype, **WEIGHTS)
+    rng = setting.rng()
     biases = {
         name: round_to(rng.normal(size=value.shape), "bfloat16")
         for name, value in problem.state["params"].items()
@@ -273,11 +269,11 @@ def constant_heads(run: Run, continue_logit: float) -> tuple[Problem, dict[str, 
     uses=["losses"],
     level=2,
 )
-def losses_of_constant_predictions(run: Run) -> None:
+def losses_of_constant_predictions(setting: Setting) -> Cases:
     """Where no prediction depends on the state, every loss is the plain mean over all steps, without weights; logits
     may be huge."""
     for continue_logit in (6.0, 1000.0, -1000.0):
-        problem, biases = constant_heads(run, continue_logit)
+        problem, biases = constant_heads(setting, continue_logit)
         batch, config = problem.batch, problem.config
         logits, mode = biases["decoder/vector/out/mode/bias"], batch["mode"]
         sigmoid = 1 / (1 + np.exp(-biases["decoder/image/out/bias"]))  # depth comes first
@@ -297,38 +293,40 @@ def losses_of_constant_predictions(run: Run) -> None:
             "dynamics": np.full(target.shape, config.free_nats),
             "representation": np.full(target.shape, config.free_nats),
         }
-        actual = run.call("losses", *problem.loss_arguments)[1]["losses"]
-        run.holds("the names of the losses", set(actual) - {"actor", "critic", "replay_critic"} == set(expected))
-        for name, values in expected.items():
-            magnitude = abs(continue_logit) if name == "continue" else values.mean()
-            where = f"{name} with continue logit {continue_logit}"
-            run.compare(
-                where,
-                actual[name],
+
+        def names(c: Comparisons, result: Any, expected: dict[str, Any] = expected) -> None:
+            c.holds("the names of the losses", set(result[1]["losses"]) - set(BEHAVIOR) == set(expected))
+
+        bound = 1e-12 if setting.dtype == "float64" else 256 * setting.u
+        means = (
+            Equal(
                 values.mean(),
-                magnitude=magnitude,
-                bound=1e-12 if run.dtype == "float64" else 256 * run.u,
+                at=(1, "losses", name),
+                where=f"{name} with continue logit {continue_logit}",
+                magnitude=abs(continue_logit) if name == "continue" else values.mean(),
+                bound=bound,
             )
+            for name, values in expected.items()
+        )
+        yield judged("losses", problem.loss_arguments, names, *means)
 
 
 @check("WM-1", "WM-6", "WM-8", "WM-9", "WM-15", "WM-16", "NET-1", uses=["losses"], level=2, dtypes=WHOLE)
-def losses_read_the_state_of_the_same_step(run: Run) -> None:
+def losses_read_the_state_of_the_same_step(setting: Setting) -> Cases:
     """With heads that depend strongly on memory and latents, each loss pairs state, reward, flag and observation of one
     step."""
-    problem = problem_of(run, "both", "mixed")
+    problem = problem_of(setting, "both", "mixed")
     strong = ("reward/out/kernel", "continue/out/kernel", "decoder/vector/out/mode/kernel", "rssm/prior/out/kernel")
     params = {name: value * 8 if name in strong else value for name, value in problem.state["params"].items()}
-    names = [
-        name
-        for name in agent.losses(*problem.loss_arguments)[1]["losses"]
-        if name not in ("actor", "critic", "replay_critic")
-    ]
     arguments = (params, *problem.loss_arguments[1:])
-    expected, actual = agent.losses(*arguments)[1]["losses"], run.call("losses", *arguments)[1]["losses"]
-    for name in names:
-        run.compare(
-            name, actual[name], expected[name], magnitude=abs(expected[name]) + 1, bound=bound_of(run, 1e-10, 2e-4)
-        )
+    expected = agent.losses(*arguments)[1]["losses"]
+    bound = bound_of(setting, 1e-10, 2e-4)
+    losses = (
+        Equal(value, at=(1, "losses", name), where=name, magnitude=abs(value) + 1, bound=bound)
+        for name, value in expected.items()
+        if name not in BEHAVIOR
+    )
+    yield judged("losses", arguments, *losses)
 
 
 def scaled(problem: Problem, scale: float) -> Problem:
@@ -341,35 +339,37 @@ def scaled(problem: Problem, scale: float) -> Problem:
 
 
 @check("WM-14", uses=["losses", "loss_derivatives"], level=2)
-def free_nats_leave_no_gradient(run: Run) -> None:
+def free_nats_leave_no_gradient(setting: Setting) -> Cases:
     """Where posterior and prior are close everywhere, both losses are exactly the free nats and move with no
     parameter."""
-    problem = scaled(make_problem(run.seed, run.profile, "vector", "continuous", run.dtype), 2.0**-6)
-    losses = run.call("losses", *problem.loss_arguments)[1]["losses"]
-    derivatives = run.call(
-        "loss_derivatives", *problem.loss_arguments, list(unit_directions(problem, run.seed).values())
-    )
-    for name in ("dynamics", "representation"):
-        run.exact(name, losses[name], problem.config.free_nats)
-        run.exact(f"derivatives of {name}", derivatives[name], np.zeros_like(derivatives[name]))
+    problem = scaled(make_problem(setting.seed, setting.profile, "vector", "continuous", setting.dtype), 2.0**-6)
+    directions = list(unit_directions(problem, setting.seed).values())
+    names = ("dynamics", "representation")
+    free = (exactly(problem.config.free_nats, at=(1, "losses", name), where=name) for name in names)
+    yield judged("losses", problem.loss_arguments, *free)
+    still = (exactly(np.zeros(len(directions)), at=(name,), where=f"derivatives of {name}") for name in names)
+    yield judged("loss_derivatives", (*problem.loss_arguments, directions), *still)
 
 
 @check("WM-12", "WM-13", "RSSM-23", uses=["loss_derivatives"], level=2)
-def constants_of_the_kl(run: Run) -> None:
+def constants_of_the_kl(setting: Setting) -> Cases:
     """Where every step is a reset: dynamics moves with prior and core alone, representation with posterior, encoder and
     core alone."""
-    problem = scaled(make_problem(run.seed, run.profile, "vector", "continuous", run.dtype), 8.0)
+    problem = scaled(make_problem(setting.seed, setting.profile, "vector", "continuous", setting.dtype), 8.0)
     batch = problem.batch | {"is_first": np.ones_like(problem.batch["is_first"])}
     problem = dataclasses.replace(problem, batch=batch)
-    directions = unit_directions(problem, run.seed)
-    derivatives = run.call("loss_derivatives", *problem.loss_arguments, list(directions.values()))
+    directions = unit_directions(problem, setting.seed)
     moving = {"dynamics": ("prior", "core"), "representation": ("posterior", "encoder", "core")}
-    for name, labels in moving.items():
-        for label, derivative in zip(directions, derivatives[name], strict=True):
-            if label in labels:
-                run.holds(f"{name} moves with {label}", derivative != 0)
-            elif not label.startswith("all"):
-                run.exact(f"derivative of {name} by {label}", derivative, 0.0)
+
+    def moves(c: Comparisons, derivatives: Any) -> None:
+        for name, labels in moving.items():
+            for label, derivative in zip(directions, derivatives[name], strict=True):
+                if label in labels:
+                    c.holds(f"{name} moves with {label}", derivative != 0)
+                elif not label.startswith("all"):
+                    c.exact(f"derivative of {name} by {label}", derivative, 0.0)
+
+    yield judged("loss_derivatives", (*problem.loss_arguments, list(directions.values())), moves)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -388,6 +388,14 @@ class Sequences:
     @property
     def arguments(self) -> tuple[Any, ...]:
         return tuple(getattr(self, field.name) for field in dataclasses.fields(self))
+
+    def observing(self, others: dict[str, np.ndarray], start: int) -> "Sequences":
+        """With other observations from a step on."""
+        observation = {
+            key: np.concatenate([value[:, :start], others[key][:, start:]], 1)
+            for key, value in self.observation.items()
+        }
+        return dataclasses.replace(self, observation=observation)
 
     def nudged(self, distance: float) -> "Sequences":
         return dataclasses.replace(self, noise={name: value + distance for name, value in self.noise.items()})
@@ -410,48 +418,43 @@ def sequences(seed: int, profile: str, dtype: str, observation: str, context: in
         }
         params = random_parameters(rng, config, task, dtype)
         recorded = random_observations(rng, task, (ROWS, STEPS))
-        drawn = Sequences(
-            params, recorded, random_actions(rng, task, (ROWS, STEPS)), STARTS, context, noise, task, config
-        )
-        below, above = (
-            reference.open_loop(*drawn.nudged(distance).arguments) for distance in (-SAMPLING_MARGIN, SAMPLING_MARGIN)
-        )
+        action = random_actions(rng, task, (ROWS, STEPS))
+        drawn = Sequences(params, recorded, action, STARTS, context, noise, task, config)
+        below, above = (reference.open_loop(*drawn.nudged(d).arguments) for d in (-SAMPLING_MARGIN, SAMPLING_MARGIN))
         if all(np.array_equal(below[key], above[key]) for key in below):
             return drawn
     raise RuntimeError("no sequences keep every sample away from the next class")
 
 
 @check("WM-20", "WM-21", "WM-23", "RSSM-18", "NET-1", uses=["open_loop"], level=1, dtypes=WHOLE)
-def open_loop_matches(run: Run) -> None:
+def open_loop_matches(setting: Setting) -> Cases:
     """Every prediction of every step: images, vectors in their units, probabilities, rewards; long and short contexts,
     and resets."""
     for observation, context in (("both", CONTEXT), ("vector", 1), ("vector", STEPS - 1)):
-        drawn = sequences(run.seed, run.profile, run.dtype, observation, context)
+        drawn = sequences(setting.seed, setting.profile, setting.dtype, observation, context)
         expected = reference.open_loop(*drawn.arguments)
         magnitude = {key: 1 + np.abs(value).max() for key, value in expected.items()}
-        run.expect("open_loop", drawn.arguments, expected, magnitude=magnitude, bound=bound_of(run, 1e-10, 2e-4))
+        yield equal("open_loop", drawn.arguments, expected, magnitude=magnitude, bound=bound_of(setting, 1e-10, 2e-4))
 
 
 @check("WM-23", uses=["open_loop"], level=1)
-def open_loop_literals(run: Run) -> None:
+def open_loop_literals(setting: Setting) -> Cases:
     """Decoder outputs 1, -2 and 0 are 1.718282, -6.389056 and 0; logits 0, ln 3 a quarter and three; a reward between
     two bins."""
-    config, task = small_config(run.profile, run.dtype), spaces("both", "mixed")
+    config, task = small_config(setting.profile, setting.dtype), spaces("both", "mixed")
     ln3 = float(round_to(SURE, "bfloat16"))  # so that every dtype holds it
     odds = math.exp(ln3)
+    bins = np.arange(config.bins)
     params = {name: np.zeros(entry.shape) for name, entry in parameter_table(config, task).items()} | {
         "decoder/vector/out/position/bias": np.array([1.0, -2, 0]),
         "decoder/vector/out/mode/bias": np.array([0.0, ln3, 0, ln3, 0]),
         "decoder/image/out/bias": np.array([0.0, 0, ln3, -ln3]),  # depth comes first
         "continue/out/bias": np.array([ln3]),
-        "reward/out/bias": np.where(
-            np.isin(np.arange(config.bins), (15, 16)), np.arange(config.bins) == 16, -1024 / ln3
-        )
-        * ln3,
+        "reward/out/bias": np.where(np.isin(bins, (15, 16)), bins == 16, -1024 / ln3) * ln3,
     }
     noise = {"posterior": np.zeros((1, 1, config.stoch)), "prior": np.zeros((1, 1, config.stoch))}
-    observation = random_observations(run.rng(), task, (1, 2))
-    inputs = observation, random_actions(run.rng(), task, (1, 2)), np.zeros((1, 2), bool), 1, noise
+    observation = random_observations(setting.rng(), task, (1, 2))
+    inputs = observation, random_actions(setting.rng(), task, (1, 2)), np.zeros((1, 2), bool), 1, noise
     high, low = odds / (1 + odds), 1 / (1 + odds)
     expected = {
         "position": [math.e - 1, 1 - math.e**2, 0],
@@ -462,7 +465,7 @@ def open_loop_literals(run: Run) -> None:
         "continue_": high,
     }
     both = {key: np.stack([[value, value]]) for key, value in expected.items()}
-    run.expect("open_loop", (params, *inputs, task, config), both, magnitude="tensor", bound=256 * run.u)
+    yield equal("open_loop", (params, *inputs, task, config), both, magnitude="tensor", bound=256 * setting.u)
 
 
 def same(one: dict[str, Any], other: dict[str, Any], row: int, steps: slice) -> bool:
@@ -471,74 +474,87 @@ def same(one: dict[str, Any], other: dict[str, Any], row: int, steps: slice) -> 
 
 
 @check("WM-20", "WM-21", "WM-22", uses=["open_loop"], level=1)
-def open_loop_reads_only_the_context(run: Run) -> None:
+def open_loop_reads_only_the_context(setting: Setting) -> Cases:
     """What is observed after the context changes nothing; the last step of it changes what follows, and nothing that
     came before."""
-    drawn = sequences(run.seed, run.profile, "float64", "both", CONTEXT)
-    before = run.call("open_loop", *drawn.arguments)
-    others = random_observations(np.random.default_rng(run.seed + 1), drawn.spaces, (ROWS, STEPS))
+    drawn = sequences(setting.seed, setting.profile, "float64", "both", CONTEXT)
+    others = random_observations(np.random.default_rng(setting.seed + 1), drawn.spaces, (ROWS, STEPS))
     others["position"][:] = np.nan
-    hidden = {
-        key: np.concatenate([value[:, :CONTEXT], others[key][:, CONTEXT:]], 1)
-        for key, value in drawn.observation.items()
-    }
-    after = run.call("open_loop", *dataclasses.replace(drawn, observation=hidden).arguments)
-    for key, value in before.items():
-        run.exact(f"{key} after other observations", after[key], value)
-    last, changes = slice(CONTEXT - 1, CONTEXT), []
+
+    def unread(c: Comparisons, before: Any, after: Any) -> None:
+        for key, value in before.items():
+            c.exact(f"{key} after other observations", after[key], value)
+
+    hidden = drawn.observing(others, CONTEXT)
+    yield related(unread, ("open_loop", drawn.arguments), ("open_loop", hidden.arguments))
+
+    calls, last = [], CONTEXT - 1
     for seed in range(10):  # with one noise or another, the other observation draws other latents
         rng = np.random.default_rng(seed)
         noise = drawn.noise | {"posterior": uniforms(rng, *drawn.noise["posterior"].shape)}
-        before = run.call("open_loop", *dataclasses.replace(drawn, noise=noise).arguments)
-        others = random_observations(rng, drawn.spaces, (ROWS, STEPS))
-        shown = {
-            key: np.concatenate([value[:, : last.start], others[key][:, last.start :]], 1)
-            for key, value in drawn.observation.items()
-        }
-        after = run.call("open_loop", *dataclasses.replace(drawn, noise=noise, observation=shown).arguments)
-        run.holds("nothing changes before the observation that changed", same(before, after, 0, slice(last.start)))
-        changes.append([not same(before, after, 0, steps) for steps in (last, slice(CONTEXT, None))])
-    run.holds("the last observation of the context counts, at its step and later", np.any(changes, 0))
+        before = dataclasses.replace(drawn, noise=noise)
+        after = before.observing(random_observations(rng, drawn.spaces, (ROWS, STEPS)), last)
+        calls += [("open_loop", before.arguments), ("open_loop", after.arguments)]
+
+    def counts(c: Comparisons, *predictions: Any) -> None:
+        changes = []
+        for before, after in zip(predictions[::2], predictions[1::2], strict=True):
+            c.holds("nothing changes before the observation that changed", same(before, after, 0, slice(last)))
+            changes.append(
+                [not same(before, after, 0, steps) for steps in (slice(last, CONTEXT), slice(CONTEXT, None))]
+            )
+        c.holds("the last observation of the context counts, at its step and later", np.any(changes, 0))
+
+    yield related(counts, *calls)
 
 
 @check("WM-20", "RSSM-13", "RSSM-14", "RSSM-18", uses=["open_loop"], level=1)
-def open_loop_follows_actions_and_resets(run: Run) -> None:
+def open_loop_follows_actions_and_resets(setting: Setting) -> Cases:
     """An action moves the prediction of its own step and nothing before; after a reset nothing from before it counts,
     not even NaN."""
-    drawn = sequences(run.seed, run.profile, "float64", "vector", CONTEXT)
-    before = run.call("open_loop", *drawn.arguments)
+    drawn = sequences(setting.seed, setting.profile, "float64", "vector", CONTEXT)
     for step in (1, CONTEXT, STEPS - 1):
+
+        def moves(c: Comparisons, before: Any, after: Any, step: int = step) -> None:
+            c.holds(f"nothing changes before action {step}", same(before, after, 0, slice(step)))
+            c.holds(f"action {step} counts at its own step", not same(before, after, 0, slice(step, step + 1)))
+
         action = drawn.prev_action.copy()
         action[0, step] = -action[0, step] + 0.25
-        after = run.call("open_loop", *dataclasses.replace(drawn, prev_action=action).arguments)
-        run.holds(f"nothing changes before action {step}", same(before, after, 0, slice(step)))
-        run.holds(f"action {step} counts at its own step", not same(before, after, 0, slice(step, step + 1)))
+        other = dataclasses.replace(drawn, prev_action=action)
+        yield related(moves, ("open_loop", drawn.arguments), ("open_loop", other.arguments))
     for row, step in ((1, CONTEXT + 2), (2, CONTEXT)):
+
+        def forgets(c: Comparisons, before: Any, after: Any, row: int = row, step: int = step) -> None:
+            where = f"nothing before the reset of row {row} counts after it"
+            c.holds(where, same(before, after, row, slice(step, None)))
+
         action = drawn.prev_action.copy()
         action[row, : step + 1] = np.nan
-        after = run.call("open_loop", *dataclasses.replace(drawn, prev_action=action).arguments)
-        run.holds(f"nothing before the reset of row {row} counts after it", same(before, after, row, slice(step, None)))
+        other = dataclasses.replace(drawn, prev_action=action)
+        yield related(forgets, ("open_loop", drawn.arguments), ("open_loop", other.arguments))
 
 
 @check("WM-24", "WM-19", "CON-8", uses=["open_loop"], level=1)
-def open_loop_refuses(run: Run) -> None:
+def open_loop_refuses(setting: Setting) -> Cases:
     """A context that is no part of the sequence, missing keys, and rows, steps or sizes that differ, are refused."""
-    drawn = sequences(run.seed, run.profile, "float64", "vector", CONTEXT)
+    drawn = sequences(setting.seed, setting.profile, "float64", "vector", CONTEXT)
     config, task = drawn.config, drawn.spaces
     for context in (-1, 0, STEPS, STEPS + 1):
-        run.refuses("open_loop", *dataclasses.replace(drawn, context=context).arguments, naming=["context"])
+        yield refused("open_loop", *dataclasses.replace(drawn, context=context).arguments, naming=["context"])
     for key, value in drawn.observation.items():
         rest = {name: other for name, other in drawn.observation.items() if name != key}
         for wrong in (rest, rest | {key: value[..., :-1]}, rest | {key: value[:, :-1]}, rest | {key: value[:1]}):
-            run.refuses("open_loop", *dataclasses.replace(drawn, observation=wrong).arguments, naming=[key])
+            yield refused("open_loop", *dataclasses.replace(drawn, observation=wrong).arguments, naming=[key])
     for size in (
         (ROWS, STEPS, task.action_size - 1),
         (ROWS, STEPS - 1, task.action_size),
         (1, STEPS, task.action_size),
     ):
-        run.refuses("open_loop", *dataclasses.replace(drawn, prev_action=np.zeros(size)).arguments)
+        yield refused("open_loop", *dataclasses.replace(drawn, prev_action=np.zeros(size)).arguments)
     for starts in (STARTS[:, 0], STARTS[:1], STARTS[..., None]):
-        run.refuses("open_loop", *dataclasses.replace(drawn, is_first=starts).arguments)
+        yield refused("open_loop", *dataclasses.replace(drawn, is_first=starts).arguments)
     for name, steps in (("posterior", CONTEXT), ("prior", STEPS - CONTEXT)):
         for shape in ((ROWS, steps + 1, config.stoch), (1, steps, config.stoch), (ROWS, steps, 1)):
-            run.refuses("open_loop", *dataclasses.replace(drawn, noise=drawn.noise | {name: np.zeros(shape)}).arguments)
+            noise = drawn.noise | {name: np.zeros(shape)}
+            yield refused("open_loop", *dataclasses.replace(drawn, noise=noise).arguments)
