@@ -32,8 +32,15 @@ DERIVATIVES = {"float64": 1e-5, "float32": 1e-2, "bfloat16": 0.1}  # those of th
 TRACE_LENGTH = 5000
 # so many checks, the most elementary first, are compared with every mutant in vain before the rest is left unexplained
 TRIES = 8
-VALUES = ("agent.losses_match",)
-"""The checks of all losses."""
+VALUES = tuple(
+    f"losses.{name}"
+    for name in (
+        *("latents_match", "reconstructions_match", "reward_and_continue_match", "dynamics_and_representation_match"),
+        *("predictions_match", "return_range_matches", "actor_matches", "critic_matches", "replay_critic_matches"),
+        "total_matches",
+    )
+)
+"""The checks that all losses are right."""
 
 
 @dataclasses.dataclass(frozen=True)

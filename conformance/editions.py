@@ -160,7 +160,7 @@ def _stand_ins(check: Check, setting: Setting) -> list[tuple[Check, Setting]]:
 def _compared(
     check: Check, adapter: object, edition: Edition, setting: Setting, shrink: bool, ordinary: bool
 ) -> Result:
-    """Runs a check of whose calls every one is compared with the edition's reference. What the check itself demands does
+    """Runs a check and compares every answer with that of the edition's reference. What the check itself demands does
     not count."""
     mutant = own_reference(edition.name)
     assert mutant is not None

@@ -3,7 +3,7 @@
 import dataclasses
 import math
 import traceback
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from conformance.adapters.numpy_adapter import NumpyAdapter
 from conformance.case import Call, Setting
 from conformance.check import CHECKS, Check
 from conformance.compare import CandidateLost, Comparisons, Deviation, Worst
+from conformance.drawing import cases
 from conformance.judge import Ask, asking, judge_cases, standing_in
 from conformance.requirements import requirements
 from conformance.script import Script
@@ -191,6 +192,14 @@ def selected_checks(dtype: str, only: str = "") -> list[Check]:
 def run_checks(adapter: object, setting: Setting, only: str = "") -> Iterable[Result]:
     for check in selected_checks(setting.dtype, only):
         yield run_check(check, adapter, setting)
+
+
+def calls_of(checks: Iterable[Check], adapter: object, setting: Setting) -> Iterator[tuple[str, tuple[Any, ...]]]:
+    """The calls of all cases, which a candidate that compiles may want to know in advance."""
+    for check in checks:
+        if check.cases is not None and not missing(adapter, check):
+            for case, _ in cases(check.cases, setting):
+                yield from ((call.function, call.arguments) for call in case.calls)
 
 
 def rows(results: Iterable[Result]) -> list[Row]:

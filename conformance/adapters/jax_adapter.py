@@ -1,8 +1,11 @@
 """The JAX backend as a candidate."""
 
+import contextlib
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping
+import os
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
@@ -19,6 +22,7 @@ ROWS = (transforms, distributions, layers, rssm, networks, world_model, returns,
 EXACT = ("truncated_normal", "dense", "mlp")
 # Run operation by operation: their Python floats would each need a compilation.
 EAGER_ROWS = (transforms, distributions)
+QUICK = {"xla_backend_optimization_level": 0}
 
 
 class JaxAdapter:
@@ -30,6 +34,7 @@ class JaxAdapter:
         self.exact = np.dtype("float64" if dtype == "float64" else "float32")
         self.device = select_device(device)
         self.compiled: dict[Any, Callable[..., Any]] = {}
+        self.compiler_options: dict[str, Any] | None = None
 
     def __getattr__(self, name: str) -> Any:
         for row in ROWS:
@@ -42,6 +47,19 @@ class JaxAdapter:
                 first = jnp.bfloat16 if self.dtype == "bfloat16" and row is layers and name not in EXACT else None
                 return functools.partial(self._run, function, name, row not in EAGER_ROWS, first)
         raise AttributeError(name)
+
+    def prepare(self, calls: Iterable[tuple[str, tuple[Any, ...]]]) -> None:
+        """Compiles what these calls need, several at a time, and everything without the optimizations that take longer
+        than small calls themselves. What a call raises is raised when it is made."""
+        self.compiler_options = QUICK
+        distinct = {_signature(call): call for call in calls}.values()
+
+        def make(call: tuple[str, tuple[Any, ...]]) -> None:
+            with contextlib.suppress(Exception):
+                getattr(self, call[0])(*call[1])
+
+        with ThreadPoolExecutor(os.cpu_count()) as threads:
+            list(threads.map(make, distinct))
 
     def exponential_bins(self, bins: int) -> np.ndarray:
         return transforms.exponential_bins(bins)
@@ -122,7 +140,8 @@ class JaxAdapter:
             statics = tuple(
                 repr(argument) if static else None for argument, static in zip(arguments, is_static, strict=True)
             )
-            call = self.compiled.setdefault((key, statics), jax.jit(call))
+            compiled = jax.jit(call, compiler_options=self.compiler_options)
+            call = self.compiled.setdefault((key, statics), compiled)
         with jax.default_device(self.device):
             return _to_numpy(call(*dynamic))
 
@@ -142,6 +161,15 @@ class JaxAdapter:
             with np.errstate(over="ignore"):
                 return jnp.asarray(array.astype(self.exact)).astype(dtype or self.exact)
         return jnp.asarray(array, np.int32 if array.dtype.kind == "i" else array.dtype)
+
+
+def _signature(value: Any) -> Any:
+    """What a compiled function depends on: names, shapes and types of arrays, and everything else as it is."""
+    if isinstance(value, Mapping):
+        return tuple((key, _signature(entry)) for key, entry in value.items())
+    if isinstance(value, tuple | list):
+        return tuple(map(_signature, value))
+    return (value.shape, str(value.dtype)) if isinstance(value, np.ndarray) else repr(value)
 
 
 def _to_numpy(x: Any) -> Any:

@@ -13,7 +13,7 @@ from conformance.compare import DTYPES
 from conformance.diagnosis import diagnose
 from conformance.editions import Fit, best, by_comparison, fit, judge_twice, telling_checks, to_json
 from conformance.errors import UserError
-from conformance.execute import FAILING, CheckOptions, Result, selected_checks
+from conformance.execute import FAILING, CheckOptions, Result, calls_of, selected_checks
 from conformance.expected import ExpectedFailures, read_expected
 from conformance.reports import badge, html, junit, markdown, terminal
 from conformance.results import Data, identity, result_data, write, write_text
@@ -129,6 +129,9 @@ def _fit(console: Console, checks: list[Check], adapter: object, options: argpar
 
 def _run_all(console: Console, checks: list[Check], adapter: object, asked: CheckOptions) -> Iterable[Result]:
     edition = editions()[asked.edition]
+    if prepare := getattr(adapter, "prepare", None):
+        with console.status("compiling"):
+            prepare(calls_of(checks, adapter, asked.setting))
     with console.status("checking") as status:
         for number, check in enumerate(checks, 1):
             status.update(f"{number}/{len(checks)} {check.name}")
