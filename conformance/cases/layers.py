@@ -6,8 +6,11 @@ from typing import Any
 import hypothesis.strategies as st
 import numpy as np
 
-from conformance.check import EPSILON, Run, check, round_to
+from conformance.case import Case, Cases, Drawn, Equal, Setting, equal, exact, exactly, judged, refused, related
+from conformance.check import check, script
+from conformance.compare import EPSILON, WIDE, Comparisons, round_to
 from conformance.problems import random_parameters, small_config, spaces
+from conformance.script import Script
 from conformance.strategies import adversarial_numbers, arrays, normals, seeds
 from reference_numpy import layers as reference
 from reference_numpy import networks
@@ -22,14 +25,14 @@ LITERAL = {"float64": 4e-7, "float32": 4e-7, "bfloat16": EPSILON["bfloat16"]}
 LARGEST = 2.273694468677113
 
 
-def expect_sums(run: Run, function: str, arguments: tuple[Any, ...], terms: int, *, roundings: int = 2) -> None:
-    """Compares a layer that sums `terms` products and a bias, [LAY-1]. In bfloat16 its result and that of its products
-    may be rounded."""
+def equal_sums(setting: Setting, function: str, arguments: tuple[Any, ...], terms: int, *, roundings: int = 2) -> Case:
+    """A layer that sums `terms` products and a bias, [LAY-1]. In bfloat16 its result and that of its products may be
+    rounded."""
     x, kernel, bias, *rest = arguments
-    layer = getattr(reference, function)
+    layer, dtype = getattr(reference, function), setting.dtype
     magnitude = layer(np.abs(x), np.abs(kernel), np.abs(bias), *rest)
-    bound = roundings * 0.51 * EPSILON["bfloat16"] if run.dtype == "bfloat16" else (terms + 16) * EPSILON[run.dtype]
-    run.expect(function, arguments, layer(*arguments), magnitude=magnitude, bound=bound)
+    bound = roundings * 0.51 * EPSILON[dtype] if dtype == "bfloat16" else (terms + 16) * EPSILON[dtype]
+    return equal(function, arguments, layer(*arguments), magnitude=magnitude, bound=bound)
 
 
 def is_double(actual: Any, expected: np.ndarray) -> bool:
@@ -53,159 +56,166 @@ NO_BIAS = np.zeros(1)
 
 
 @check("LAY-2", "LAY-3", uses=["linear", "block_linear"], level=0)
-def linear_literals(run: Run) -> None:
+def linear_literals(setting: Setting) -> Cases:
     """[1, 2] gives [9.5, 12, 14.5]; with two blocks [1, 2, 3, 4] gives [21, 4301]; one block is a linear layer."""
-    kernel = np.array([[1.0, 2, 3], [4, 5, 6]])
-    run.exact(
-        "linear", run.call("linear", np.array([1.0, 2]), kernel, np.array([0.5, 0, -0.5])), np.array([9.5, 12, 14.5])
-    )
+    kernel, bias = np.array([[1.0, 2, 3], [4, 5, 6]]), np.array([0.5, 0, -0.5])
+    expected = np.array([9.5, 12, 14.5])
+    yield exact("linear", (np.array([1.0, 2]), kernel, bias), expected)
     x, blocks = np.array([1.0, 2, 3, 4]), np.array([[[1.0], [10]], [[100], [1000]]])
-    run.expect("block_linear", (x, blocks, np.array([0.0, 1])), np.array([21.0, 4301]), bound=LITERAL[run.dtype])
+    bound = LITERAL[setting.dtype]
+    yield equal("block_linear", (x, blocks, np.array([0.0, 1])), np.array([21.0, 4301]), bound=bound)
     blocks = np.array([[[1.0, 2], [0, 0]], [[0, 0], [3, 4]]])
-    run.exact("positions", run.call("block_linear", x, blocks, np.array([1.0, 0, 0, 2])), np.array([2.0, 2, 12, 18]))
-    run.exact(
-        "one block",
-        run.call("block_linear", np.array([1.0, 2]), kernel[None], np.array([0.5, 0, -0.5])),
-        np.array([9.5, 12, 14.5]),
-    )
+    arguments = (x, blocks, np.array([1.0, 0, 0, 2]))
+    yield exact("block_linear", arguments, np.array([2.0, 2, 12, 18]), where="positions")
+    yield exact("block_linear", (np.array([1.0, 2]), kernel[None], bias), expected, where="one block")
 
 
 @check("LAY-1", "LAY-2", "LAY-3", "LAY-16", "CON-30", uses=["linear", "block_linear"], level=0)
-def linear_matches(run: Run) -> None:
+def linear_matches(setting: Setting) -> Cases:
     """Any leading axes, inputs of several magnitudes, few terms and many."""
 
-    @run.for_all(seed=seeds(), leading=LEADING, sizes=st.sampled_from([(8, 5), (96, 3)]), scale=SCALES)
-    def _(seed: int, leading: tuple[int, ...], sizes: tuple[int, int], scale: float) -> None:
+    def case(seed: int, leading: tuple[int, ...], sizes: tuple[int, int], scale: float) -> Cases:
         inputs, outputs = sizes
-        x = run.cast(normals(seed, *leading, inputs, scale=scale))
-        kernel, bias = run.cast(normals(seed + 1, inputs, outputs)), run.cast(normals(seed + 2, outputs))
-        expect_sums(run, "linear", (x, kernel, bias), inputs)
-        kernel, bias = run.cast(normals(seed + 3, 4, inputs // 4, outputs)), run.cast(normals(seed + 4, 4 * outputs))
-        expect_sums(run, "block_linear", (x, kernel, bias), inputs // 4)
+        cast = setting.cast
+        x = cast(normals(seed, *leading, inputs, scale=scale))
+        kernel, bias = cast(normals(seed + 1, inputs, outputs)), cast(normals(seed + 2, outputs))
+        yield equal_sums(setting, "linear", (x, kernel, bias), inputs)
+        kernel, bias = cast(normals(seed + 3, 4, inputs // 4, outputs)), cast(normals(seed + 4, 4 * outputs))
+        yield equal_sums(setting, "block_linear", (x, kernel, bias), inputs // 4)
+
+    yield Drawn(case, seed=seeds(), leading=LEADING, sizes=st.sampled_from([(8, 5), (96, 3)]), scale=SCALES)
 
 
 @check("LAY-1", "CON-23", uses=SUMS, level=0)
-def long_sums_are_accurate(run: Run) -> None:
+def long_sums_are_accurate(setting: Setting) -> Cases:
     """Thousands of positive products: sums that are kept in less than float32 stop growing."""
-    rng = run.rng()
-    x, kernel = run.cast(rng.uniform(0.5, 1, (2, 4096))), run.cast(rng.uniform(0.5, 1, (4096, 8)))
-    expect_sums(run, "linear", (x, kernel, np.zeros(8)), 4096, roundings=1)
-    expect_sums(run, "block_linear", (x, kernel.reshape(2, 2048, 8), np.zeros(16)), 2048, roundings=1)
-    x, kernel = run.cast(rng.uniform(0.5, 1, (4, 4, 64))), run.cast(rng.uniform(0.5, 1, (5, 5, 64, 2)))
-    expect_sums(run, "convolution", (x, kernel, np.zeros(2), 1), 1600, roundings=1)
-    expect_sums(run, "convolution", (x, kernel, np.zeros(2), 2), 1600, roundings=1)
-    expect_sums(run, "transposed_convolution", (x, kernel, np.zeros(2)), 576, roundings=1)
+    rng, cast = setting.rng(), setting.cast
+    x, kernel = cast(rng.uniform(0.5, 1, (2, 4096))), cast(rng.uniform(0.5, 1, (4096, 8)))
+    yield equal_sums(setting, "linear", (x, kernel, np.zeros(8)), 4096, roundings=1)
+    yield equal_sums(setting, "block_linear", (x, kernel.reshape(2, 2048, 8), np.zeros(16)), 2048, roundings=1)
+    x, kernel = cast(rng.uniform(0.5, 1, (4, 4, 64))), cast(rng.uniform(0.5, 1, (5, 5, 64, 2)))
+    yield equal_sums(setting, "convolution", (x, kernel, np.zeros(2), 1), 1600, roundings=1)
+    yield equal_sums(setting, "convolution", (x, kernel, np.zeros(2), 2), 1600, roundings=1)
+    yield equal_sums(setting, "transposed_convolution", (x, kernel, np.zeros(2)), 576, roundings=1)
 
 
 @check("LAY-1", "LAY-4", "CON-22", uses=[*SUMS, "rms_norm", "silu", "dense"], level=0, dtypes=("bfloat16",))
-def results_have_the_compute_dtype(run: Run) -> None:
+def results_have_the_compute_dtype(setting: Setting) -> Cases:
     """Float32 parameters beside bfloat16 inputs are rounded to bfloat16, and so is the result; who computes in float64
     is let off."""
-    rng = run.rng()
+    rng = setting.rng()
     kernel, bias, scale = (round_to(rng.normal(size=shape), "float32") for shape in ((5, 5, 2, 3), (3,), (3,)))
-    x = run.cast(rng.normal(size=(4, 6, 2)))
+    x = setting.cast(rng.normal(size=(4, 6, 2)))
     params = {"layer/kernel": kernel[0, 0], "layer/bias": bias, "layer/scale": scale}
-    for function, arguments in (
-        ("linear", (x, kernel[0, 0], bias)),
-        ("block_linear", (x, kernel[:2, 0, :1], np.append(bias, bias))),
-        ("convolution", (x, kernel, bias, 1)),
-        ("convolution", (x, kernel, bias, 2)),
-        ("transposed_convolution", (x, kernel, bias)),
-        ("rms_norm", (run.cast(rng.normal(size=(4, 3))), scale, 1e-4)),
-        ("dense", (params, "layer", x, 1e-4)),
-    ):
-        result = np.asarray(run.call(function, *arguments), np.float64)
-        double = is_double(result, getattr(reference, function)(*arguments))
-        run.holds(f"{function} gives bfloat16 numbers", double or np.array_equal(result, round_to(result, "bfloat16")))
-    # 1 + 2^-9 becomes 1: nothing is left of the difference.
+
+    def rounded(function: str, *arguments: Any) -> Case:
+        expected = getattr(reference, function)(*arguments)
+
+        def is_bfloat16(c: Comparisons, result: np.ndarray) -> None:
+            double = is_double(result, expected)
+            same = np.array_equal(np.asarray(result, np.float64), round_to(result, "bfloat16"))
+            c.holds(f"{function} gives bfloat16 numbers", double or same)
+
+        return judged(function, arguments, is_bfloat16)
+
+    yield rounded("linear", x, kernel[0, 0], bias)
+    yield rounded("block_linear", x, kernel[:2, 0, :1], np.append(bias, bias))
+    yield rounded("convolution", x, kernel, bias, 1)
+    yield rounded("convolution", x, kernel, bias, 2)
+    yield rounded("transposed_convolution", x, kernel, bias)
+    yield rounded("rms_norm", setting.cast(rng.normal(size=(4, 3))), scale, 1e-4)
+    yield rounded("dense", params, "layer", x, 1e-4)
+
     one = np.array([1.0])
-    in_double = is_double(run.call("silu", one), reference.silu(one))
-    difference = run.call("linear", np.ones(2), np.array([[1 + 2.0**-9], [-1]]), np.zeros(1))
-    run.exact("the kernel is rounded to bfloat16", difference, np.array([2.0**-9 if in_double else 0]))
+
+    def difference(c: Comparisons, silu: np.ndarray, result: np.ndarray) -> None:
+        # 1 + 2^-9 becomes 1: nothing is left of the difference.
+        expected = np.array([2.0**-9 if is_double(silu, reference.silu(one)) else 0])
+        c.exact("the kernel is rounded to bfloat16", result, expected)
+
+    kernel = np.array([[1 + 2.0**-9], [-1]])
+    yield related(difference, ("silu", (one,)), ("linear", (np.ones(2), kernel, np.zeros(1))))
 
 
 @check("LAY-4", uses=["rms_norm"], level=0)
-def rms_norm_literals(run: Run) -> None:
+def rms_norm_literals(setting: Setting) -> Cases:
     """[3, 4] becomes [.8485247, 1.1313663]; epsilon rules tiny rows; zeros stay zero; no mean is taken off; a NaN
     spoils its row only."""
-    rounding = LITERAL[run.dtype]
-    scale = np.array([1.0, 1])
-    run.expect("rms_norm", (np.array([3.0, 4]), scale, 1e-4), np.array([0.8485247, 1.1313663]), bound=rounding)
-    run.expect(
-        "rms_norm", (np.array([3.0, 4]), np.array([2.0, -0.5]), 1e-4), np.array([1.6970494, -0.5656832]), bound=rounding
-    )
-    tiny = np.full(2, 1e-5)
-    run.expect("rms_norm", (tiny, scale, 1e-4), np.full(2, 9.999995e-4), bound=2 * rounding)
-    run.exact("zeros", run.call("rms_norm", np.zeros((2, 3)), np.ones(3), 1e-4), np.zeros((2, 3)))
-    run.expect("rms_norm", (np.full(3, 2.0), np.ones(3), 1e-4), np.full(3, 0.9999875), bound=rounding)
-    huge = run.cast([[1e18, -1e18, 1e18, 1e18], [1.0, 1, -1, 1]])
-    run.expect("rms_norm", (huge, np.ones(4), 1e-4), np.sign(huge), bound=max(rounding, 1e-4))
-    broken = run.call("rms_norm", np.array([[1.0, np.nan], [0, 0]]), scale, 1e-4)
-    run.exact("NaN", broken, np.array([[np.nan, np.nan], [0, 0]]))
+    rounding = LITERAL[setting.dtype]
+    x, scale = np.array([3.0, 4]), np.array([1.0, 1])
+    yield equal("rms_norm", (x, scale, 1e-4), np.array([0.8485247, 1.1313663]), bound=rounding)
+    expected = np.array([1.6970494, -0.5656832])
+    yield equal("rms_norm", (x, np.array([2.0, -0.5]), 1e-4), expected, bound=rounding)
+    yield equal("rms_norm", (np.full(2, 1e-5), scale, 1e-4), np.full(2, 9.999995e-4), bound=2 * rounding)
+    yield exact("rms_norm", (np.zeros((2, 3)), np.ones(3), 1e-4), np.zeros((2, 3)), where="zeros")
+    yield equal("rms_norm", (np.full(3, 2.0), np.ones(3), 1e-4), np.full(3, 0.9999875), bound=rounding)
+    huge = setting.cast([[1e18, -1e18, 1e18, 1e18], [1.0, 1, -1, 1]])
+    yield equal("rms_norm", (huge, np.ones(4), 1e-4), np.sign(huge), bound=max(rounding, 1e-4))
+    broken, expected = np.array([[1.0, np.nan], [0, 0]]), np.array([[np.nan, np.nan], [0, 0]])
+    yield exact("rms_norm", (broken, scale, 1e-4), expected, where="NaN")
 
 
 @check("LAY-1", "LAY-4", "LAY-16", uses=["rms_norm"], level=0)
-def rms_norm_matches(run: Run) -> None:
+def rms_norm_matches(setting: Setting) -> Cases:
     """Rows of several magnitudes and any leading axes, each on its own, images too; in bfloat16 the scale and the
     result are rounded."""
 
-    @run.for_all(
-        seed=seeds(), leading=LEADING, n=st.sampled_from([5, 64]), scale=st.sampled_from([1e-4, 1e-2, 1.0, 1e4])
-    )
-    def _(seed: int, leading: tuple[int, ...], n: int, scale: float) -> None:
+    def case(seed: int, leading: tuple[int, ...], n: int, scale: float) -> Cases:
         rng = np.random.default_rng(seed)
-        x = run.cast(rng.normal(0.5, 1, (*leading, n)) * scale * 10 ** rng.uniform(-1, 1, (*leading, 1)))
-        # A parameter: float32 beside bfloat16 inputs.
-        weight = round_to(rng.normal(1, 0.5, n), "float64" if run.dtype == "float64" else "float32")
-        actual = run.call("rms_norm", x, weight, 1e-4)
-        double = is_double(actual, reference.rms_norm(x, weight, 1e-4))
-        bound = 0.51 * EPSILON["bfloat16"] if run.dtype == "bfloat16" else (n + 16) * run.u
-        run.compare(
-            "rms_norm", actual, reference.rms_norm(x, weight if double else run.cast(weight), 1e-4), bound=bound
-        )
+        x = setting.cast(rng.normal(0.5, 1, (*leading, n)) * scale * 10 ** rng.uniform(-1, 1, (*leading, 1)))
+        weight = round_to(rng.normal(1, 0.5, n), WIDE[setting.dtype])  # a parameter: float32 beside bfloat16 inputs
+        expected = reference.rms_norm(x, weight, 1e-4)
+
+        def rounded(c: Comparisons, actual: np.ndarray) -> None:
+            right = expected if is_double(actual, expected) else reference.rms_norm(x, setting.cast(weight), 1e-4)
+            c.compare("rms_norm", actual, right, bound=0.51 * EPSILON["bfloat16"])
+
+        demand = rounded if setting.dtype == "bfloat16" else Equal(expected, bound=(n + 16) * setting.u)
+        yield judged("rms_norm", (x, weight, 1e-4), demand)
+
+    scale = st.sampled_from([1e-4, 1e-2, 1.0, 1e4])
+    yield Drawn(case, seed=seeds(), leading=LEADING, n=st.sampled_from([5, 64]), scale=scale)
 
 
 @check("LAY-5", uses=["silu"], level=0)
-def silu_literals(run: Run) -> None:
+def silu_literals(setting: Setting) -> Cases:
     """silu of 1, -1, 2 and -20; zeros, infinities, NaN and huge numbers."""
-    bound = 2 * LITERAL[run.dtype]
     x, expected = np.array([1.0, -1, 2]), np.array([0.7310586, -0.2689414, 1.7615942])
-    run.expect("silu", (x,), expected, bound=bound)
-    if run.dtype != "bfloat16":
-        run.expect("silu", (np.array([-20.0]),), np.array([-4.1223072e-8]), bound=5e-6)
-    special = run.cast([0.0, -0.0, np.inf, -np.inf, np.nan, -1e30, -3e38, 1e30, 3e38])
-    expected = np.array([0, 0, np.inf, np.nan, np.nan, 0, 0, special[7], special[8]])
-    run.exact("silu", run.call("silu", special), expected)
+    yield equal("silu", (x,), expected, bound=2 * LITERAL[setting.dtype])
+    if setting.dtype != "bfloat16":
+        yield equal("silu", (np.array([-20.0]),), np.array([-4.1223072e-8]), bound=5e-6)
+    special = setting.cast([0.0, -0.0, np.inf, -np.inf, np.nan, -1e30, -3e38, 1e30, 3e38])
+    yield exact("silu", (special,), np.array([0, 0, np.inf, np.nan, np.nan, 0, 0, special[7], special[8]]))
 
 
 @check("LAY-5", uses=["silu"], level=0)
-def silu_matches(run: Run) -> None:
+def silu_matches(setting: Setting) -> Cases:
     """Any numbers, any shape; small negative results keep their relative precision."""
 
-    @run.for_all(
-        x=LEADING.flatmap(lambda shape: arrays(st.one_of(adversarial_numbers(), st.floats(-120, 20, width=32)), shape))
-    )
-    def _(x: np.ndarray) -> None:
-        x = run.cast(x)
+    def case(x: np.ndarray) -> Cases:
+        x = setting.cast(x)
         expected = reference.silu(x)
         size = np.where(np.isfinite(x), np.abs(x), 0)
-        if run.dtype == "bfloat16":
-            run.expect("silu", (x,), expected, magnitude=size, bound=2 * EPSILON["bfloat16"])
+        if setting.dtype == "bfloat16":
+            yield equal("silu", (x,), expected, magnitude=size, bound=2 * EPSILON["bfloat16"])
         else:
-            magnitude = 16 * (1 + size) * np.where(np.isfinite(expected), np.abs(expected), 0) + 128 * run.tiny / run.u
-            run.expect("silu", (x,), expected, magnitude=np.minimum(magnitude, 1e300), bound=run.u)
+            finite = np.where(np.isfinite(expected), np.abs(expected), 0)
+            magnitude = np.minimum(16 * (1 + size) * finite + 128 * setting.tiny / setting.u, 1e300)
+            yield equal("silu", (x,), expected, magnitude=magnitude, bound=setting.u)
+
+    numbers = st.one_of(adversarial_numbers(), st.floats(-120, 20, width=32))
+    yield Drawn(case, x=LEADING.flatmap(lambda shape: arrays(numbers, shape)))
 
 
 @check("LAY-6", uses=["convolution"], level=0)
-def convolution_literals(run: Run) -> None:
+def convolution_literals(setting: Setting) -> Cases:
     """Padding 2 and 2 at stride 1, 1 and 2 at stride 2; taps are not flipped, rows and columns not exchanged; the bias
     comes once."""
     ones = np.ones((4, 4, 1))
-    taps = np.array([3.0, 4, 4, 3])
-    run.exact("stride 1", run.call("convolution", ones, ONES, NO_BIAS, 1)[..., 0], np.outer(taps, taps))
-    taps = np.array([4.0, 3])
-    run.exact("stride 2", run.call("convolution", ones, ONES, NO_BIAS, 2)[..., 0], np.outer(taps, taps))
-    run.exact("bias", run.call("convolution", ones, 0 * ONES, np.array([2.5]), 2)[..., 0], np.full((2, 2), 2.5))
+    for stride, taps in ((1, [3.0, 4, 4, 3]), (2, [4.0, 3])):
+        expected = np.outer(taps, taps)[..., None]
+        yield exact("convolution", (ones, ONES, NO_BIAS, stride), expected, where=f"stride {stride}")
+    yield exact("convolution", (ones, 0 * ONES, np.array([2.5]), 2), np.full((2, 2, 1), 2.5), where="bias")
     seen = {
         (0, 0): [[0, 0], [0, 11]],
         (1, 1): [[0, 2], [20, 22]],
@@ -213,243 +223,225 @@ def convolution_literals(run: Run) -> None:
         (1, 2): [[1, 3], [21, 23]],
     }
     for tap, image in seen.items():
-        run.exact(
-            f"tap {tap} at stride 2",
-            run.call("convolution", pixels(4, 4), one_tap(*tap), NO_BIAS, 2)[..., 0],
-            np.array(image),
-        )
-    expected = np.pad(pixels(4, 6)[:, 1:, 0], ((1, 0), (0, 1)))[:4]
-    run.exact(
-        "tap (1, 3) at stride 1", run.call("convolution", pixels(4, 6), one_tap(1, 3), NO_BIAS, 1)[..., 0], expected
-    )
+        arguments, expected = (pixels(4, 4), one_tap(*tap), NO_BIAS, 2), np.array(image)[..., None]
+        yield exact("convolution", arguments, expected, where=f"tap {tap} at stride 2")
+    expected = np.pad(pixels(4, 6)[:, 1:], ((1, 0), (0, 1), (0, 0)))[:4]
+    yield exact("convolution", (pixels(4, 6), one_tap(1, 3), NO_BIAS, 1), expected, where="tap (1, 3) at stride 1")
 
 
 @check("LAY-7", uses=["transposed_convolution"], level=0)
-def transposed_convolution_literals(run: Run) -> None:
+def transposed_convolution_literals(setting: Setting) -> Cases:
     """A pixel of 1 shows taps 1 and 2, not flipped; ones count the taps 1, 2, 2, 2; the bias comes once to every
     output."""
+    function = "transposed_convolution"
     kernel = (10.0 * np.arange(5)[:, None] + np.arange(5))[..., None, None]
-    one = np.ones((1, 1, 1))
-    run.exact(
-        "one pixel", run.call("transposed_convolution", one, kernel, NO_BIAS)[..., 0], np.array([[11, 12], [21, 22]])
-    )
-    taps = np.array([1.0, 2, 2, 2])
-    run.exact(
-        "ones", run.call("transposed_convolution", np.ones((2, 2, 1)), ONES, NO_BIAS)[..., 0], np.outer(taps, taps)
-    )
-    run.exact(
-        "bias",
-        run.call("transposed_convolution", np.ones((2, 3, 1)), 0 * ONES, np.array([2.5]))[..., 0],
-        np.full((4, 6), 2.5),
-    )
-    corner = np.zeros((4, 4))
-    corner[3, 1] = 1  # from the pixel (2, 0), as 2 * 2 - 1 and 2 * 0 + 1
-    pixel = np.zeros((3, 2, 1))
+    expected = np.array([[11, 12], [21, 22]])[..., None]
+    yield exact(function, (np.ones((1, 1, 1)), kernel, NO_BIAS), expected, where="one pixel")
+    expected = np.outer([1.0, 2, 2, 2], [1.0, 2, 2, 2])[..., None]
+    yield exact(function, (np.ones((2, 2, 1)), ONES, NO_BIAS), expected, where="ones")
+    arguments = (np.ones((2, 3, 1)), 0 * ONES, np.array([2.5]))
+    yield exact(function, arguments, np.full((4, 6, 1), 2.5), where="bias")
+    pixel, corner = np.zeros((3, 2, 1)), np.zeros((6, 4, 1))
     pixel[2, 0] = 1
-    run.exact("tap (0, 2)", run.call("transposed_convolution", pixel, one_tap(0, 2), NO_BIAS)[:4, :, 0], corner)
+    corner[3, 1] = 1  # from the pixel (2, 0), as 2 * 2 - 1 and 2 * 0 + 1
+    yield exact(function, (pixel, one_tap(0, 2), NO_BIAS), corner, where="tap (0, 2)")
 
 
 @check("LAY-1", "LAY-6", "LAY-7", "LAY-16", "CON-30", uses=["convolution", "transposed_convolution"], level=0)
-def convolutions_match(run: Run) -> None:
+def convolutions_match(setting: Setting) -> Cases:
     """Random images whose sides and channels all differ, with any leading axes."""
 
-    @run.for_all(seed=seeds(), leading=LEADING, scale=SCALES)
-    def _(seed: int, leading: tuple[int, ...], scale: float) -> None:
-        x = run.cast(normals(seed, *leading, 4, 6, 3, scale=scale))
-        kernel, bias = run.cast(normals(seed + 1, 5, 5, 3, 2)), run.cast(normals(seed + 2, 2))
-        expect_sums(run, "convolution", (x, kernel, bias, 1), 75)
-        expect_sums(run, "convolution", (x, kernel, bias, 2), 75)
-        expect_sums(run, "transposed_convolution", (x, kernel, bias), 27)
+    def case(seed: int, leading: tuple[int, ...], scale: float) -> Cases:
+        x = setting.cast(normals(seed, *leading, 4, 6, 3, scale=scale))
+        kernel, bias = setting.cast(normals(seed + 1, 5, 5, 3, 2)), setting.cast(normals(seed + 2, 2))
+        yield equal_sums(setting, "convolution", (x, kernel, bias, 1), 75)
+        yield equal_sums(setting, "convolution", (x, kernel, bias, 2), 75)
+        yield equal_sums(setting, "transposed_convolution", (x, kernel, bias), 27)
+
+    yield Drawn(case, seed=seeds(), leading=LEADING, scale=SCALES)
 
 
 @check("LAY-7", uses=["convolution", "transposed_convolution"], level=0)
-def transposed_convolution_is_the_adjoint(run: Run) -> None:
+def transposed_convolution_is_the_adjoint(setting: Setting) -> Cases:
     """<convolution(y, w, 2), x> is <y, transposed(x, w')>, w' being w with its last two axes exchanged."""
 
-    @run.for_all(seed=seeds())
-    def _(seed: int) -> None:
-        y, x, kernel = (
-            run.cast(normals(seed, 6, 8, 3)),
-            run.cast(normals(seed + 1, 3, 4, 2)),
-            run.cast(normals(seed + 2, 5, 5, 3, 2)),
+    def case(seed: int) -> Cases:
+        y, x = setting.cast(normals(seed, 6, 8, 3)), setting.cast(normals(seed + 1, 3, 4, 2))
+        kernel = setting.cast(normals(seed + 2, 5, 5, 3, 2))
+
+        def adjoint(c: Comparisons, down: np.ndarray, up: np.ndarray) -> None:
+            down, up = np.asarray(down, np.float64) * x, np.asarray(up, np.float64) * y
+            magnitude = np.abs(down).sum() + np.abs(up).sum()
+            c.compare("inner products", up.sum(), down.sum(), magnitude=magnitude)
+
+        yield related(
+            adjoint,
+            ("convolution", (y, kernel, np.zeros(2), 2)),
+            ("transposed_convolution", (x, kernel.swapaxes(2, 3).copy(), np.zeros(3))),
         )
-        down = np.asarray(run.call("convolution", y, kernel, np.zeros(2), 2), np.float64) * x
-        up = (
-            np.asarray(run.call("transposed_convolution", x, kernel.swapaxes(2, 3).copy(), np.zeros(3)), np.float64) * y
-        )
-        run.compare("inner products", up.sum(), down.sum(), magnitude=np.abs(down).sum() + np.abs(up).sum())
+
+    yield Drawn(case, seed=seeds())
+
+
+IDENTITY = {"a/hidden0/kernel": np.eye(2), "a/hidden0/bias": np.zeros(2), "a/hidden0/scale": np.ones(2)}
 
 
 @check("LAY-8", uses=["dense", "mlp"], level=0)
-def dense_literals(run: Run) -> None:
-    """Linear, then norm, then SiLU: [3, 4] through an identity becomes silu of [.8485247, 1.1313663]; a missing
-    parameter is named."""
-    params = {"a/hidden0/kernel": np.eye(2), "a/hidden0/bias": np.zeros(2), "a/hidden0/scale": np.ones(2)}
-    bound = 2 * LITERAL[run.dtype]
-    expected = np.array([0.5941859, 0.8554159])
-    run.expect("dense", (params, "a/hidden0", np.array([3.0, 4]), 1e-4), expected, bound=bound)
-    run.expect("mlp", (params, "a", np.array([3.0, 4]), 1, 1e-4), expected, bound=bound)
-    for function, arguments in (
-        ("dense", (params, "a/hidden1", np.ones(2), 1e-4)),
-        ("mlp", (params, "a", np.ones(2), 2, 1e-4)),
-    ):
+def dense_literals(setting: Setting) -> Cases:
+    """Linear, then norm, then SiLU: [3, 4] through an identity becomes silu of [.8485247, 1.1313663]."""
+    x, expected, bound = np.array([3.0, 4]), np.array([0.5941859, 0.8554159]), 2 * LITERAL[setting.dtype]
+    yield equal("dense", (IDENTITY, "a/hidden0", x, 1e-4), expected, bound=bound)
+    yield equal("mlp", (IDENTITY, "a", x, 1, 1e-4), expected, bound=bound)
+
+
+@script("LAY-8", uses=["dense", "mlp"], level=0)
+def missing_parameters_are_named(script: Script) -> None:
+    """A layer whose parameter is missing raises a KeyError that names it."""
+    calls: dict[str, tuple[Any, ...]] = {"dense": ("a/hidden1", np.ones(2), 1e-4), "mlp": ("a", np.ones(2), 2, 1e-4)}
+    for function, arguments in calls.items():
         try:
-            run.call(function, *arguments)
+            script.call(function, IDENTITY, *arguments)
         except KeyError as error:
-            run.holds(f"{function} names the missing parameter", "a/hidden1/" in str(error))
+            script.holds(f"{function} names the missing parameter", "a/hidden1/" in str(error))
         else:
-            run.holds(f"{function} raises KeyError for a missing parameter", False)
+            script.holds(f"{function} raises KeyError for a missing parameter", False)
 
 
 @check("LAY-8", "LAY-16", uses=["dense", "mlp"], level=0)
-def mlp_matches(run: Run) -> None:
+def mlp_matches(setting: Setting) -> Cases:
     """One to three layers with biases, scales and sizes that differ, in their order, with any leading axes and
     epsilon."""
 
-    @run.for_all(seed=seeds(), leading=LEADING, layers=st.sampled_from([1, 3]), epsilon=st.sampled_from([1e-4, 0.5]))
-    def _(seed: int, leading: tuple[int, ...], layers: int, epsilon: float) -> None:
-        params, rng = {}, np.random.default_rng(seed)
+    def case(seed: int, leading: tuple[int, ...], layers: int, epsilon: float) -> Cases:
+        params, rng, cast = {}, np.random.default_rng(seed), setting.cast
         for layer, (inputs, outputs) in enumerate(((5, 7), (7, 6), (6, 4))):
             name = f"net/hidden{layer}"
-            params[f"{name}/kernel"] = run.cast(rng.normal(size=(inputs, outputs)))
-            params[f"{name}/bias"], params[f"{name}/scale"] = (
-                run.cast(rng.normal(size=outputs)),
-                run.cast(rng.normal(1, 0.5, outputs)),
-            )
-        x = run.cast(rng.normal(size=(*leading, 5)) * 3)
+            params[f"{name}/kernel"] = cast(rng.normal(size=(inputs, outputs)))
+            params[f"{name}/bias"] = cast(rng.normal(size=outputs))
+            params[f"{name}/scale"] = cast(rng.normal(1, 0.5, outputs))
+        x = cast(rng.normal(size=(*leading, 5)) * 3)
         expected = reference.mlp(params, "net", x, layers, epsilon)
-        run.expect("mlp", (params, "net", x, layers, epsilon), expected, magnitude="tensor", factor=4)
+        yield equal("mlp", (params, "net", x, layers, epsilon), expected, magnitude="tensor", factor=4)
         expected = reference.dense(params, "net/hidden0", x, epsilon)
-        run.expect("dense", (params, "net/hidden0", x, epsilon), expected, magnitude="tensor", factor=2)
+        yield equal("dense", (params, "net/hidden0", x, epsilon), expected, magnitude="tensor", factor=2)
+
+    layers, epsilon = st.sampled_from([1, 3]), st.sampled_from([1e-4, 0.5])
+    yield Drawn(case, seed=seeds(), leading=LEADING, layers=layers, epsilon=epsilon)
 
 
 @check("LAY-9", "LAY-11", uses=["truncated_normal"], level=0)
-def truncated_normal_literals(run: Run) -> None:
+def truncated_normal_literals(setting: Setting) -> Cases:
     """The quantiles 0, 1/4, 1/2, 3/4 and 0.9; fan 1024 divides by 32; scale 0 gives exact zeros; scalars stay
     scalars."""
-    bound = 2e-7 if run.dtype == "float64" else 1.2e-5
+    function, bound = "truncated_normal", 2e-7 if setting.dtype == "float64" else 1.2e-5
     quantiles = np.array([-2.2736945, -0.7265726, 0, 0.7265726, 1.3460640])
     uniform = np.array([0, 0.25, 0.5, 0.75, round_to(0.9, "float32")])
-    run.expect("truncated_normal", (uniform, 1, 1.0), quantiles, magnitude=1.0, bound=bound)
-    run.expect("truncated_normal", (uniform[4], 1024, 1.0), 0.0420645, magnitude=1 / 32, bound=4e-6 + bound)
-    run.expect(
-        "truncated_normal", (uniform[:, None], 4, 0.01), 0.005 * quantiles[:, None], magnitude=0.005, bound=bound
-    )
-    run.exact("scale 0", run.call("truncated_normal", uniform, 7, 0.0), np.zeros(5))
+    yield equal(function, (uniform, 1, 1.0), quantiles, magnitude=1.0, bound=bound)
+    yield equal(function, (uniform[4], 1024, 1.0), 0.0420645, magnitude=1 / 32, bound=4e-6 + bound)
+    column = 0.005 * quantiles[:, None]
+    yield equal(function, (uniform[:, None], 4, 0.01), column, magnitude=0.005, bound=bound)
+    yield exact(function, (uniform, 7, 0.0), np.zeros(5), where="scale 0")
 
 
 @check("LAY-9", "LAY-11", uses=["truncated_normal"], level=0)
-def truncated_normal_matches(run: Run) -> None:
+def truncated_normal_matches(setting: Setting) -> Cases:
     """Every quantile, the outermost too; increasing; never beyond 2.2737; the standard deviation is exact."""
-    error = 1e-10 if run.dtype == "float64" else 1e-5
+    error = 1e-10 if setting.dtype == "float64" else 1e-5
     grid = (np.arange(4096) + 0.5) / 4096
-    weights = np.asarray(
-        run.expect(
-            "truncated_normal",
-            (grid, 1, 1.0),
-            reference.truncated_normal(grid, 1, 1.0),
-            magnitude=1.0,
-            bound=1.14 * error,
-        )
-    )
-    run.compare("standard deviation", np.std(weights), 1.0, bound=1e-3)
-    run.holds("increasing", np.diff(weights) > 0)
+
+    def spread(c: Comparisons, weights: np.ndarray) -> None:
+        weights = np.asarray(weights)
+        c.compare("standard deviation", np.std(weights), 1.0, bound=1e-3)
+        c.holds("increasing", np.diff(weights) > 0)
+
+    right = Equal(reference.truncated_normal(grid, 1, 1.0), magnitude=1.0, bound=1.14 * error)
+    yield judged("truncated_normal", (grid, 1, 1.0), right, spread)
+
+    def case(uniform: np.ndarray, fan: int, scale: float) -> Cases:
+        deviation = scale / np.sqrt(fan)
+
+        def within_bounds(c: Comparisons, weights: np.ndarray) -> None:
+            c.holds("within the bounds", np.abs(weights) <= LARGEST * deviation * (1 + 4 * setting.u))
+
+        expected = reference.truncated_normal(uniform, fan, scale)
+        right = Equal(expected, magnitude=deviation, bound=1.14 * error)
+        yield judged("truncated_normal", (uniform, fan, scale), right, within_bounds)
 
     edges = st.sampled_from([0.0, 2.0**-24, 2.0**-10, 0.5, 1 - 2.0**-10, 1 - 2.0**-23, 1 - 2.0**-24])
-    strategy = st.one_of(edges, st.integers(0, 2**23 - 1).map(lambda k: k / 2.0**23))
-
-    @run.for_all(
-        uniform=LEADING.flatmap(lambda shape: arrays(strategy, shape)),
-        fan=st.sampled_from([1, 25, 1024]),
-        scale=st.sampled_from([1.0, 0.01]),
-    )
-    def _(uniform: np.ndarray, fan: int, scale: float) -> None:
-        deviation = scale / np.sqrt(fan)
-        expected = reference.truncated_normal(uniform, fan, scale)
-        drawn = run.expect("truncated_normal", (uniform, fan, scale), expected, magnitude=deviation, bound=1.14 * error)
-        run.holds("within the bounds", np.abs(drawn) <= LARGEST * deviation * (1 + 4 * run.u))
+    numbers = st.one_of(edges, st.integers(0, 2**23 - 1).map(lambda k: k / 2.0**23))
+    uniform = LEADING.flatmap(lambda shape: arrays(numbers, shape))
+    yield Drawn(case, uniform=uniform, fan=st.sampled_from([1, 25, 1024]), scale=st.sampled_from([1.0, 0.01]))
 
 
 @check("LAY-9", "LAY-10", uses=["initial_parameters"], level=1)
-def fans_are_those_of_whole_layers(run: Run) -> None:
+def fans_are_those_of_whole_layers(setting: Setting) -> Cases:
     """With every uniform at 0.9, each kernel is 1.3460640 times its scale over the root of its fan: all blocks, all 25
     taps together."""
-    task, config = (
-        spaces(),
-        small_config(run.profile, run.dtype, actor_outscale=0.01, reward_outscale=0.0, critic_outscale=0.0),
-    )
-    table = parameter_table(config, task)
-    uniform = {
-        name: np.full(entry.shape, 0.9) for name, entry in table.items() if entry.initializer == "truncated_normal"
-    }
-    params = run.call("initial_parameters", table, uniform)
+    outscales = {"actor_outscale": 0.01, "reward_outscale": 0.0, "critic_outscale": 0.0}
+    table = parameter_table(small_config(setting.profile, setting.dtype, **outscales), spaces())
+    kernels = {name: entry for name, entry in table.items() if entry.initializer == "truncated_normal"}
+    uniform = {name: np.full(entry.shape, 0.9) for name, entry in kernels.items()}
+    demands = []
     for name, entry in table.items():
-        *others, part = name.split("/")
-        if part == "kernel":
-            axes = entry.shape
+        axes = entry.shape
+        if name.endswith("/kernel"):
             fan = {2: axes[0], 3: axes[0] * axes[1], 4: 25 * axes[-2]}[len(axes)]
-            scale = (
-                0.01
-                if name.startswith("actor/out/")
-                else 0.0
-                if "/".join(others) in ("reward/out", "critic/out")
-                else 1.0
-            )
+            zero = name in ("reward/out/kernel", "critic/out/kernel")
+            scale = 0.0 if zero else 0.01 if name.startswith("actor/out/") else 1.0
             expected = np.full(axes, 1.3460640 * scale / np.sqrt(fan))
-            run.compare(name, params[name], expected, magnitude=1 / np.sqrt(fan), bound=2e-5)
+            demands.append(Equal(expected, (name,), where=name, magnitude=1 / np.sqrt(fan), bound=2e-5))
         else:
-            run.exact(name, params[name], np.full(entry.shape, 1.0 if part == "scale" else 0.0))
+            demands.append(exactly(np.full(axes, 1.0 if name.endswith("/scale") else 0.0), (name,), name))
+    yield judged("initial_parameters", (table, uniform), *demands)
 
 
 @check("LAY-12", "LAY-13", uses=["max_pool", "upsample"], level=0)
-def pooling_literals(run: Run) -> None:
+def pooling_literals(setting: Setting) -> Cases:
     """[[1, 2], [3, 4]] pools to 4 and [[1, 2]] grows to [[1, 1, 2, 2], [1, 1, 2, 2]]; a NaN anywhere in a window
     shows."""
-    run.exact("max_pool", run.call("max_pool", np.array([[[1.0], [2]], [[3], [4]]])), np.array([[[4]]]))
-    run.exact(
-        "upsample", run.call("upsample", np.array([[[1.0], [2]]]))[..., 0], np.array([[1, 1, 2, 2], [1, 1, 2, 2]])
-    )
-    run.exact("negative numbers", run.call("max_pool", np.full((2, 2, 1), -3.0)), np.full((1, 1, 1), -3.0))
+    yield exact("max_pool", (np.array([[[1.0], [2]], [[3], [4]]]),), np.array([[[4]]]))
+    yield exact("upsample", (np.array([[[1.0], [2]]]),), np.array([[1, 1, 2, 2], [1, 1, 2, 2]])[..., None])
+    yield exact("max_pool", (np.full((2, 2, 1), -3.0),), np.full((1, 1, 1), -3.0), where="negative numbers")
     for row in range(2):
         for column in range(2):
             x = np.zeros((2, 4, 1))
             x[row, column] = np.nan
-            run.exact("NaN", run.call("max_pool", x)[..., 0], np.array([[np.nan, 0]]))
+            yield exact("max_pool", (x,), np.array([[[np.nan], [0]]]), where="NaN")
 
 
 @check("LAY-12", "LAY-13", "LAY-16", uses=["max_pool", "upsample"], level=0)
-def pooling_matches(run: Run) -> None:
+def pooling_matches(setting: Setting) -> Cases:
     """Every window, channel and leading axis on its own, exactly."""
 
-    @run.for_all(seed=seeds(), leading=LEADING)
-    def _(seed: int, leading: tuple[int, ...]) -> None:
-        x = run.cast(normals(seed, *leading, 4, 6, 3))
+    def case(seed: int, leading: tuple[int, ...]) -> Cases:
+        x = setting.cast(normals(seed, *leading, 4, 6, 3))
         for function in ("max_pool", "upsample"):
-            run.exact(function, run.call(function, x), getattr(reference, function)(x))
+            yield exact(function, (x,), getattr(reference, function)(x))
+
+    yield Drawn(case, seed=seeds(), leading=LEADING)
 
 
 @check("LAY-14", uses=["encoder", "decoder"], level=1)
-def image_stages_match(run: Run) -> None:
+def image_stages_match(setting: Setting) -> Cases:
     """Halving and doubling stages, and one at full resolution, part by part, of the kind that the profile has."""
-    plain = small_config(run.profile)
-    compare_image_stages(run, [(plain.cnn_sampling, plain.cnn_outer)])
+    plain = small_config(setting.profile)
+    yield from image_stages(setting, [(plain.cnn_sampling, plain.cnn_outer)])
 
 
 @check("LAY-14", uses=["encoder", "decoder"], level=1)
-def other_image_stages_match(run: Run) -> None:
+def other_image_stages_match(setting: Setting) -> Cases:
     """The same with the other choices of `cnn_sampling` and `cnn_outer`."""
-    plain = small_config(run.profile)
+    plain = small_config(setting.profile)
     kinds = ((sampling, outer) for sampling in ("strided", "pooled") for outer in (False, True))
-    compare_image_stages(run, [kind for kind in kinds if kind != (plain.cnn_sampling, plain.cnn_outer)])
+    yield from image_stages(setting, [kind for kind in kinds if kind != (plain.cnn_sampling, plain.cnn_outer)])
 
 
-def compare_image_stages(run: Run, kinds: Iterable[tuple[str, bool]]) -> None:
-    task, rng = Spaces({"image": Image(8, 4, 2)}, {"action": Vector(1)}), run.rng()
+def image_stages(setting: Setting, kinds: Iterable[tuple[str, bool]]) -> Cases:
+    task, rng, dtype = Spaces({"image": Image(8, 4, 2)}, {"action": Vector(1)}), setting.rng(), setting.dtype
     for sampling, outer in kinds:
-        config = small_config(
-            run.profile, run.dtype, cnn_sampling=sampling, cnn_outer=outer, cnn_multipliers=(1, 4), blocks=4
-        )
-        params = {name: run.cast(value) for name, value in random_parameters(rng, config, task, run.dtype).items()}
+        choices = {"cnn_sampling": sampling, "cnn_outer": outer, "cnn_multipliers": (1, 4), "blocks": 4}
+        config = small_config(setting.profile, dtype, **choices)
+        params = {name: setting.cast(value) for name, value in random_parameters(rng, config, task, dtype).items()}
         image = rng.integers(0, 256, (2, 8, 4, 2)).astype(np.uint8)
         x = image / 255 - 0.5
         for index in range(2):
@@ -458,88 +450,78 @@ def compare_image_stages(run: Run, kinds: Iterable[tuple[str, bool]]) -> None:
             x = reference.convolution(x, kernel, bias, 2 if halving and sampling == "strided" else 1)
             x = reference.max_pool(x) if halving and sampling == "pooled" else x
             x = reference.silu(reference.rms_norm(x, scale, config.norm_epsilon))
-        tokens = run.call("encoder", params, {"image": image}, task, config)
-        run.compare(f"{sampling} encoder", tokens, x.reshape(2, -1), magnitude="tensor", factor=4)
-        feature = run.cast(rng.normal(size=(2, config.feature_size)))
-        expected = networks.decoder(params, feature, task, config)
-        run.compare(
-            f"{sampling} decoder",
-            run.call("decoder", params, feature, task, config),
-            expected,
-            magnitude="tensor",
-            factor=4,
-        )
+        arguments, where = (params, {"image": image}, task, config), f"{sampling} encoder"
+        yield equal("encoder", arguments, x.reshape(2, -1), where=where, magnitude="tensor", factor=4)
+        feature = setting.cast(rng.normal(size=(2, config.feature_size)))
+        expected, where = networks.decoder(params, feature, task, config), f"{sampling} decoder"
+        yield equal("decoder", (params, feature, task, config), expected, where=where, magnitude="tensor", factor=4)
 
 
 @check("LAY-15", "CON-8", uses=[*SUMS, "rms_norm", "max_pool", "upsample", "dense", "mlp", "truncated_normal"], level=0)
-def layers_refuse_shapes(run: Run) -> None:
+def layers_refuse_shapes(setting: Setting) -> Cases:
     """Sizes that do not fit, odd sides, other strides, images without channels, no layers and no fan are refused."""
     shape: tuple[int, ...]
-    x, kernel, blocks, taps, bias = (
-        np.ones((2, 4)),
-        np.ones((4, 6)),
-        np.ones((2, 2, 3)),
-        np.ones((5, 5, 2, 6)),
-        np.zeros(6),
-    )
+    x, kernel, blocks, taps = (np.ones(shape) for shape in ((2, 4), (4, 6), (2, 2, 3), (5, 5, 2, 6)))
+    bias = np.zeros(6)
     for shape in ((2, 3), (2, 1)):
         wrong: np.ndarray = np.ones(shape)
-        run.refuses("linear", wrong, kernel, bias)
-        run.refuses("block_linear", wrong, blocks, bias)
-        run.refuses("rms_norm", wrong, np.ones(4), 1e-4)
+        yield refused("linear", wrong, kernel, bias)
+        yield refused("block_linear", wrong, blocks, bias)
+        yield refused("rms_norm", wrong, np.ones(4), 1e-4)
     for shape in ((1,), (3,), (1, 6), ()):
         wrong = np.zeros(shape)
-        run.refuses("linear", x, kernel, wrong)
-        run.refuses("block_linear", x, blocks, wrong)
-        run.refuses("rms_norm", np.ones((2, 6)), wrong, 1e-4)
-        run.refuses("convolution", np.ones((4, 4, 2)), taps, wrong, 1)
-        run.refuses("transposed_convolution", np.ones((4, 4, 2)), taps, wrong)
-    run.refuses("linear", x, blocks, bias)
-    run.refuses("block_linear", x, kernel, bias)
+        yield refused("linear", x, kernel, wrong)
+        yield refused("block_linear", x, blocks, wrong)
+        yield refused("rms_norm", np.ones((2, 6)), wrong, 1e-4)
+        yield refused("convolution", np.ones((4, 4, 2)), taps, wrong, 1)
+        yield refused("transposed_convolution", np.ones((4, 4, 2)), taps, wrong)
+    yield refused("linear", x, blocks, bias)
+    yield refused("block_linear", x, kernel, bias)
     for shape in ((3, 3, 2, 6), (5, 2, 6), (5, 5, 1, 6), (5, 4, 2, 6)):
         wrong = np.ones(shape)
-        run.refuses("convolution", np.ones((4, 4, 2)), wrong, bias, 2)
-        run.refuses("transposed_convolution", np.ones((4, 4, 2)), wrong, bias)
+        yield refused("convolution", np.ones((4, 4, 2)), wrong, bias, 2)
+        yield refused("transposed_convolution", np.ones((4, 4, 2)), wrong, bias)
     for shape in ((3, 4, 2), (4, 3, 2)):
-        run.refuses("convolution", np.ones(shape), taps, bias, 2)
-        run.refuses("max_pool", np.ones(shape))
-    run.refuses("convolution", np.ones((4, 2)), taps, bias, 1)
-    run.refuses("transposed_convolution", np.ones((4, 2)), taps, bias)
-    run.refuses("max_pool", np.ones((4, 2)))
-    run.refuses("upsample", np.ones((4, 2)))
+        yield refused("convolution", np.ones(shape), taps, bias, 2)
+        yield refused("max_pool", np.ones(shape))
+    yield refused("convolution", np.ones((4, 2)), taps, bias, 1)
+    yield refused("transposed_convolution", np.ones((4, 2)), taps, bias)
+    yield refused("max_pool", np.ones((4, 2)))
+    yield refused("upsample", np.ones((4, 2)))
     for stride in (0, 3):
-        run.refuses("convolution", np.ones((6, 6, 2)), taps, bias, stride)
+        yield refused("convolution", np.ones((6, 6, 2)), taps, bias, stride)
     params = {"a/hidden0/kernel": kernel, "a/hidden0/bias": bias, "a/hidden0/scale": bias}
-    run.refuses("dense", params, "a/hidden0", np.ones((2, 3)), 1e-4)
-    run.refuses("dense", {**params, "a/hidden0/scale": np.ones(1)}, "a/hidden0", x, 1e-4)
-    run.refuses("mlp", params, "a", x, 0, 1e-4)
-    run.refuses("truncated_normal", np.zeros(2), 0, 1.0)
+    yield refused("dense", params, "a/hidden0", np.ones((2, 3)), 1e-4)
+    yield refused("dense", {**params, "a/hidden0/scale": np.ones(1)}, "a/hidden0", x, 1e-4)
+    yield refused("mlp", params, "a", x, 0, 1e-4)
+    yield refused("truncated_normal", np.zeros(2), 0, 1.0)
 
 
 @check("LAY-16", uses=[*SUMS, "rms_norm", "silu", "max_pool", "upsample"], level=0)
-def rows_do_not_mix(run: Run) -> None:
+def rows_do_not_mix(setting: Setting) -> Cases:
     """A NaN in one element of a batch stays in it, and the other elements keep every bit."""
-    rng = run.rng()
-    x, image = run.cast(rng.normal(size=(3, 2, 4))), run.cast(rng.normal(size=(3, 2, 4, 6, 4)))
-    kernel, taps, bias = (
-        run.cast(rng.normal(size=(4, 6))),
-        run.cast(rng.normal(size=(5, 5, 4, 6))),
-        run.cast(rng.normal(size=6)),
-    )
-    cases: tuple[tuple[str, np.ndarray, tuple[Any, ...]], ...] = (
-        ("linear", x, (kernel, bias)),
-        ("block_linear", x, (kernel.reshape(2, 2, 6), np.append(bias, bias))),
-        ("rms_norm", x, (kernel[:, 0], 1e-4)),
-        ("silu", x, ()),
-        ("convolution", image, (taps, bias, 1)),
-        ("convolution", image, (taps, bias, 2)),
-        ("transposed_convolution", image, (taps, bias)),
-        ("max_pool", image, ()),
-        ("upsample", image, ()),
-    )
-    for function, array, others in cases:
-        expected = np.array(run.call(function, array, *others), np.float64)
-        spoiled = array.copy()
-        spoiled[1, 1] = np.nan
-        expected[1, 1] = np.nan
-        run.exact(function, run.call(function, spoiled, *others), expected)
+    rng, cast = setting.rng(), setting.cast
+    x, image = cast(rng.normal(size=(3, 2, 4))), cast(rng.normal(size=(3, 2, 4, 6, 4)))
+    kernel, taps = cast(rng.normal(size=(4, 6))), cast(rng.normal(size=(5, 5, 4, 6)))
+    bias = cast(rng.normal(size=6))
+
+    def spoiled(function: str, array: np.ndarray, *others: Any) -> Case:
+        broken = array.copy()
+        broken[1, 1] = np.nan
+
+        def stays(c: Comparisons, before: np.ndarray, after: np.ndarray) -> None:
+            expected = np.array(before, np.float64)
+            expected[1, 1] = np.nan
+            c.exact(function, after, expected)
+
+        return related(stays, (function, (array, *others)), (function, (broken, *others)))
+
+    yield spoiled("linear", x, kernel, bias)
+    yield spoiled("block_linear", x, kernel.reshape(2, 2, 6), np.append(bias, bias))
+    yield spoiled("rms_norm", x, kernel[:, 0], 1e-4)
+    yield spoiled("silu", x)
+    yield spoiled("convolution", image, taps, bias, 1)
+    yield spoiled("convolution", image, taps, bias, 2)
+    yield spoiled("transposed_convolution", image, taps, bias)
+    yield spoiled("max_pool", image)
+    yield spoiled("upsample", image)
