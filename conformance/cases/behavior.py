@@ -7,8 +7,10 @@ from typing import Any
 import hypothesis.strategies as st
 import numpy as np
 
+from conformance.case import Cases, Drawn, Equal, Setting, equal, exact, exactly, judged, refused, related
 from conformance.cases.agent import WHOLE, problem_of
-from conformance.check import Run, check, round_to
+from conformance.check import check
+from conformance.compare import Comparisons, round_to
 from conformance.problems import action_noise, small_config
 from conformance.strategies import normals, seeds
 from reference_numpy import behavior as reference
@@ -27,7 +29,9 @@ DISCRETE = Spaces({"x": Vector(1)}, {"action": Discrete((2,))})
 CONTINUOUS = Spaces({"x": Vector(1)}, {"action": Vector(1)})
 
 
-def random_outputs(run: Run, seed: int, leading: tuple[int, ...], scale: float) -> dict[str, dict[str, np.ndarray]]:
+def random_outputs(
+    setting: Setting, seed: int, leading: tuple[int, ...], scale: float
+) -> dict[str, dict[str, np.ndarray]]:
     """Raw actor outputs of TASK."""
     rng = np.random.default_rng(seed)
     sizes = {
@@ -37,20 +41,20 @@ def random_outputs(run: Run, seed: int, leading: tuple[int, ...], scale: float) 
         "turn": {"mean": 2, "std": 2},
     }
     return {
-        key: {name: run.cast(rng.normal(0, scale, (*leading, n))) for name, n in names.items()}
+        key: {name: setting.cast(rng.normal(0, scale, (*leading, n))) for name, n in names.items()}
         for key, names in sizes.items()
     }
 
 
-def config_of(run: Run, **overrides: Any) -> Config:
-    return small_config(run.profile, run.dtype, **overrides)
+def config_of(setting: Setting, **overrides: Any) -> Config:
+    return small_config(setting.profile, setting.dtype, **overrides)
 
 
-def safe_noise(run: Run, seed: int, outputs: Any, leading: tuple[int, ...], config: Config) -> np.ndarray:
+def safe_noise(setting: Setting, seed: int, outputs: Any, leading: tuple[int, ...], config: Config) -> np.ndarray:
     """[..., K] noise whose uniforms are not near a boundary: moving them a little changes no class."""
     rng = np.random.default_rng(seed)
     for _ in range(100):
-        noise = run.cast(action_noise(rng, TASK, leading))
+        noise = setting.cast(action_noise(rng, TASK, leading))
         moved = np.array([0, 1e-3, 1e-3, 1e-3, 0, 0])
         below, above = (reference.sample_action(outputs, noise + sign * moved, TASK, config) for sign in (-1, 1))
         if np.array_equal(below, above):
@@ -70,10 +74,10 @@ def log_prob_magnitude(outputs: Any, action: np.ndarray, config: Config) -> np.n
 
 
 @check("BEH-1", "BEH-2", "BEH-3", "CON-19", "CON-25", "CON-26", "CON-27", uses=["sample_action"], level=0)
-def action_literals(run: Run) -> None:
+def action_literals(setting: Setting) -> Cases:
     """Noise and action follow the sorted keys; each entry has its own segment; a sample of 3 standard deviations is not
     clipped."""
-    config = config_of(run, actor_unimix=0.01, actor_min_std=0.25, actor_max_std=0.25)
+    config = config_of(setting, actor_unimix=0.01, actor_min_std=0.25, actor_max_std=0.25)
     outputs = {
         "turn": {"mean": np.array([0.0, -30]), "std": np.zeros(2)},
         "one": {"logits": np.array([-5.0])},
@@ -82,163 +86,160 @@ def action_literals(run: Run) -> None:
     }
     # Aim: 1 + 3/4. Buttons: 0.75 of (1/2, 1/2) and 0.25 of (0, 0, 1). One: its uniform is consumed. Turn: 0 + 1/2 and
     # -1 - 1.
-    noise = np.array([3.0, 0.75, 0.25, 0.875, 2.0, -4.0])
-    expected = np.array([1.75, 0, 1, 0, 0, 1, 1, 0.5, -2])
-    run.expect("sample_action", (outputs, noise, TASK, config), expected, magnitude=1.0, bound=16 * run.u)
-    run.expect(
-        "sample_action", (outputs, np.array([3.0, 0.25, 0.001, 0.875, 2.0, -4.0]), TASK, config),
-        np.array([1.75, 1, 0, 1, 0, 0, 1, 0.5, -2]), magnitude=1.0, bound=16 * run.u,
-    )  # fmt: skip
+    for noise, expected in (
+        ([3.0, 0.75, 0.25, 0.875, 2.0, -4.0], [1.75, 0, 1, 0, 0, 1, 1, 0.5, -2]),
+        ([3.0, 0.25, 0.001, 0.875, 2.0, -4.0], [1.75, 1, 0, 1, 0, 0, 1, 0.5, -2]),
+    ):
+        arguments = outputs, np.array(noise), TASK, config
+        yield equal("sample_action", arguments, np.array(expected), magnitude=1.0, bound=16 * setting.u)
 
 
 @check(
     "BEH-2", "BEH-3", "BEH-6", "BEH-7", "DIS-7", uses=["sample_action", "action_log_prob", "action_entropy"], level=0
 )
-def discrete_literals(run: Run) -> None:
+def discrete_literals(setting: Setting) -> Cases:
     """Logits ln 3, 0 with 1 percent uniform: 0.7475 and 0.2525, boundary at 0.7475, log-probabilities and entropy of
     the mixture."""
-    config, outputs = (
-        config_of(run, actor_unimix=0.01),
-        {"action": {"logits": run.cast(np.tile([math.log(3), 0], (4, 1)))}},
-    )
-    sample = run.call("sample_action", outputs, run.cast(np.array([[0], [0.74], [0.758], [0.99]])), DISCRETE, config)
-    run.exact("sample", sample, np.eye(2)[[0, 0, 1, 1]])
-    bound = LITERAL[run.dtype]
+    config = config_of(setting, actor_unimix=0.01)
+    outputs = {"action": {"logits": setting.cast(np.tile([math.log(3), 0], (4, 1)))}}
+    noise = setting.cast(np.array([[0], [0.74], [0.758], [0.99]]))
+    yield exact("sample_action", (outputs, noise, DISCRETE, config), np.eye(2)[[0, 0, 1, 1]], where="sample")
+    bound = LITERAL[setting.dtype]
     expected = np.array([-0.291021, -1.376344, -0.291021, 0])
     actions = np.array([[1.0, 0], [0, 1], [1, 0], [0, 0]])
-    run.expect("action_log_prob", (outputs, actions, DISCRETE, config), expected, bound=bound)
-    run.expect("action_entropy", (outputs, DISCRETE, config), np.full(4, 0.565065), bound=bound)
-    plain = config_of(run, actor_unimix=0.0)
+    yield equal("action_log_prob", (outputs, actions, DISCRETE, config), expected, bound=bound)
+    yield equal("action_entropy", (outputs, DISCRETE, config), np.full(4, 0.565065), bound=bound)
+    plain = config_of(setting, actor_unimix=0.0)
     expected = np.log([0.75, 0.25, 0.75, 1])
-    run.expect("action_log_prob", (outputs, actions, DISCRETE, plain), expected, magnitude=1.0, bound=bound)
+    yield equal("action_log_prob", (outputs, actions, DISCRETE, plain), expected, magnitude=1.0, bound=bound)
     # Far logits: finite log-probabilities without the mixture, a floor of ln(u/C) with it; probability 0 has no
     # entropy.
     far, second = {"action": {"logits": np.array([1000.0, 0])}}, np.array([0.0, 1])
-    run.expect("action_log_prob", (far, second, DISCRETE, plain), -1000.0, bound=16 * run.u)
-    run.expect("action_log_prob", (far, second, DISCRETE, config), math.log(0.005), bound=16 * run.u)
-    run.exact(
-        "entropy of certainty",
-        run.call("action_entropy", {"action": {"logits": np.array([0, -np.inf])}}, DISCRETE, plain),
-        0.0,
-    )
+    yield equal("action_log_prob", (far, second, DISCRETE, plain), -1000.0, bound=16 * setting.u)
+    yield equal("action_log_prob", (far, second, DISCRETE, config), math.log(0.005), bound=16 * setting.u)
+    certain = {"action": {"logits": np.array([0, -np.inf])}}
+    yield exact("action_entropy", (certain, DISCRETE, plain), 0.0, where="entropy of certainty")
 
 
 @check("BEH-4", "BEH-6", "BEH-7", "CON-18", uses=["sample_action", "action_log_prob", "action_entropy"], level=0)
-def continuous_literals(run: Run) -> None:
+def continuous_literals(setting: Setting) -> Cases:
     """Raw 0, 0 and the normal 1.5: action 1.339076, log-density -1.930453, entropy 1.305453; narrow normals have
     negative entropy."""
-    bound, config = LITERAL[run.dtype], config_of(run, actor_min_std=0.1, actor_max_std=1.0)
+    bound, config = LITERAL[setting.dtype], config_of(setting, actor_min_std=0.1, actor_max_std=1.0)
     outputs = {"action": {"mean": np.zeros(1), "std": np.zeros(1)}}
-    run.expect(
-        "sample_action", (outputs, np.array([1.5]), CONTINUOUS, config), np.array([1.339076]), bound=LITERAL["float32"]
-    )
-    run.expect("action_log_prob", (outputs, run.cast([1.339076]), CONTINUOUS, config), -1.930453, bound=bound)
-    run.expect("action_entropy", (outputs, CONTINUOUS, config), 1.305453, bound=LITERAL["float32"])
+    arguments = outputs, np.array([1.5]), CONTINUOUS, config
+    yield equal("sample_action", arguments, np.array([1.339076]), bound=LITERAL["float32"])
+    yield equal("action_log_prob", (outputs, setting.cast([1.339076]), CONTINUOUS, config), -1.930453, bound=bound)
+    yield equal("action_entropy", (outputs, CONTINUOUS, config), 1.305453, bound=LITERAL["float32"])
     for raw, entropy in ((-100.0, -0.883647), (100.0, 1.418939)):
         outputs = {"action": {"mean": np.zeros(1), "std": np.array([raw])}}
-        run.expect("action_entropy", (outputs, CONTINUOUS, config), entropy, bound=LITERAL["float32"])
+        yield equal("action_entropy", (outputs, CONTINUOUS, config), entropy, bound=LITERAL["float32"])
 
 
 @check("BEH-1", "BEH-2", "BEH-3", "BEH-4", "BEH-22", "CON-16", uses=["sample_action"], level=0)
-def actions_match(run: Run) -> None:
+def actions_match(setting: Setting) -> Cases:
     """Actions of several keys, any leading axes, sharp and flat outputs, any mixture and deviation."""
 
-    @run.for_all(
-        seed=seeds(), leading=LEADING, scale=st.sampled_from([0.5, 4.0]), unimix=st.sampled_from([0.0, 0.01, 0.5])
-    )
-    def _(seed: int, leading: tuple[int, ...], scale: float, unimix: float) -> None:
-        config = config_of(run, actor_unimix=unimix, actor_max_std=2.0)
-        outputs = random_outputs(run, seed, leading, scale)
-        noise = safe_noise(run, seed, outputs, leading, config)
+    def case(seed: int, leading: tuple[int, ...], scale: float, unimix: float) -> Cases:
+        config = config_of(setting, actor_unimix=unimix, actor_max_std=2.0)
+        outputs = random_outputs(setting, seed, leading, scale)
+        noise = safe_noise(setting, seed, outputs, leading, config)
         expected = reference.sample_action(outputs, noise, TASK, config)
-        run.expect(
-            "sample_action",
-            (outputs, noise, TASK, config),
-            expected,
-            magnitude=1 + 2 * np.abs(expected),
-            bound=16 * run.u,
-        )
+        size = 1 + 2 * np.abs(expected)
+        yield equal("sample_action", (outputs, noise, TASK, config), expected, magnitude=size, bound=16 * setting.u)
+
+    yield Drawn(
+        case, seed=seeds(), leading=LEADING, scale=st.sampled_from([0.5, 4.0]), unimix=st.sampled_from([0.0, 0.01, 0.5])
+    )
 
 
 @check("BEH-2", "BEH-4", "BEH-6", "BEH-7", "BEH-22", uses=["action_log_prob", "action_entropy"], level=0)
-def log_prob_and_entropy_match(run: Run) -> None:
+def log_prob_and_entropy_match(setting: Setting) -> Cases:
     """Sums over keys, entries and dimensions of any action, also of one far from the mean and of a blanked one."""
 
-    @run.for_all(
-        seed=seeds(), leading=LEADING, scale=st.sampled_from([0.5, 4.0, 60.0]), unimix=st.sampled_from([0.0, 0.01, 0.5])
-    )
-    def _(seed: int, leading: tuple[int, ...], scale: float, unimix: float) -> None:
-        config = config_of(run, actor_unimix=unimix, actor_min_std=0.05)
-        outputs = random_outputs(run, seed, leading, scale)
+    def case(seed: int, leading: tuple[int, ...], scale: float, unimix: float) -> Cases:
+        config = config_of(setting, actor_unimix=unimix, actor_min_std=0.05)
+        outputs = random_outputs(setting, seed, leading, scale)
         noise = action_noise(np.random.default_rng(seed), TASK, leading)
-        action = run.cast(reference.sample_action(outputs, noise, TASK, config) * (seed % 3))
+        action = setting.cast(reference.sample_action(outputs, noise, TASK, config) * (seed % 3))
         action[..., 1:7] = np.minimum(action[..., 1:7], 1)
-        magnitude = log_prob_magnitude(outputs, action, config)
+        size = log_prob_magnitude(outputs, action, config)
         expected = reference.action_log_prob(outputs, action, TASK, config)
-        run.expect("action_log_prob", (outputs, action, TASK, config), expected, magnitude=magnitude, bound=16 * run.u)
+        yield equal("action_log_prob", (outputs, action, TASK, config), expected, magnitude=size, bound=16 * setting.u)
         expected = reference.action_entropy(outputs, TASK, config)
-        run.expect(
-            "action_entropy", (outputs, TASK, config), expected, magnitude=np.abs(expected) + 20, bound=16 * run.u
-        )
+        size = np.abs(expected) + 20
+        yield equal("action_entropy", (outputs, TASK, config), expected, magnitude=size, bound=16 * setting.u)
+
+    yield Drawn(
+        case,
+        seed=seeds(),
+        leading=LEADING,
+        scale=st.sampled_from([0.5, 4.0, 60.0]),
+        unimix=st.sampled_from([0.0, 0.01, 0.5]),
+    )
 
 
 @check("BEH-9", uses=["actor_loss"], level=0)
-def actor_loss_literals(run: Run) -> None:
+def actor_loss_literals(setting: Setting) -> Cases:
     """Return 3, value 1, scale 4, weight 0.9: 0.130807. The entropy is rewarded, weighted, and not divided by the
     scale."""
-    config = config_of(run, entropy_scale=3e-4)
+    config = config_of(setting, entropy_scale=3e-4)
     one = np.ones((1, 1))
-    arguments = (run.cast(-0.291021 * one), run.cast(0.565065 * one), 3 * one, one, run.cast(0.9 * one), 4.0)
-    run.expect("actor_loss", (*arguments, config), np.array([[0.130807]]), bound=LITERAL[run.dtype] + 4e-6)
-    config = config_of(run, entropy_scale=0.5, actor_scale=7.0)
-    loss = run.call("actor_loss", -2 * one, 4 * one, 5 * one, one, 0.5 * one, 8.0, config)
-    run.exact("by hand", loss, np.array([[-0.5 * (0.5 * -2 + 0.5 * 4)]]))
+    log_prob, entropy, weight = (setting.cast(x * one) for x in (-0.291021, 0.565065, 0.9))
+    arguments = (log_prob, entropy, 3 * one, one, weight, 4.0)
+    yield equal("actor_loss", (*arguments, config), np.array([[0.130807]]), bound=LITERAL[setting.dtype] + 4e-6)
+    config = config_of(setting, entropy_scale=0.5, actor_scale=7.0)
+    arguments = (-2 * one, 4 * one, 5 * one, one, 0.5 * one, 8.0)
+    yield exact("actor_loss", (*arguments, config), np.array([[-0.5 * (0.5 * -2 + 0.5 * 4)]]), where="by hand")
 
 
 @check("BEH-9", "BEH-17", "BEH-22", uses=["actor_loss"], level=0)
-def actor_loss_matches(run: Run) -> None:
+def actor_loss_matches(setting: Setting) -> Cases:
     """Every entry on its own, without a mean, for any scales."""
 
-    @run.for_all(seed=seeds(), scale=st.sampled_from([1.0, 37.5]), entropy=st.sampled_from([0.0, 3e-4, 0.5]))
-    def _(seed: int, scale: float, entropy: float) -> None:
-        config = config_of(run, entropy_scale=entropy, actor_scale=3.0)
-        log_prob, returns, value = (run.cast(normals(seed + i, 4, 3, scale=s)) for i, s in enumerate((3.0, 50.0, 50.0)))
-        spread, weight = run.cast(normals(seed + 3, 4, 3)), run.cast(np.random.default_rng(seed).random((4, 3)))
+    def case(seed: int, scale: float, entropy: float) -> Cases:
+        config = config_of(setting, entropy_scale=entropy, actor_scale=3.0)
+        log_prob, returns, value = (
+            setting.cast(normals(seed + i, 4, 3, scale=s)) for i, s in enumerate((3.0, 50.0, 50.0))
+        )
+        spread, weight = setting.cast(normals(seed + 3, 4, 3)), setting.cast(np.random.default_rng(seed).random((4, 3)))
         arguments = (log_prob, spread, returns, value, weight, scale, config)
         size = weight * ((np.abs(returns) + np.abs(value)) / scale * np.abs(log_prob) + entropy * np.abs(spread))
-        run.expect("actor_loss", arguments, reference.actor_loss(*arguments), magnitude=size, bound=16 * run.u)
+        yield equal("actor_loss", arguments, reference.actor_loss(*arguments), magnitude=size, bound=16 * setting.u)
+
+    yield Drawn(case, seed=seeds(), scale=st.sampled_from([1.0, 37.5]), entropy=st.sampled_from([0.0, 3e-4, 0.5]))
 
 
-def value_logits(run: Run, seed: int, shape: tuple[int, int], bins: int, slow: bool) -> np.ndarray:
+def value_logits(setting: Setting, seed: int, shape: tuple[int, int], bins: int, slow: bool) -> np.ndarray:
     """Logits of a critic; those of the slow critic have a peak somewhere, so that their mean is well determined in
     every precision."""
     rng = np.random.default_rng(seed)
     logits = rng.normal(0, 1 if slow else 3, (*shape, bins))
     if slow:
         logits -= np.minimum(2.0 * np.abs(np.arange(bins) - rng.integers(0, bins, (*shape, 1))), 25)
-    return run.cast(logits)
+    return setting.cast(logits)
 
 
 @check("BEH-12", uses=["critic_loss"], level=0)
-def critic_loss_literals(run: Run) -> None:
+def critic_loss_literals(setting: Setting) -> Cases:
     """Equal logits cost 2 ln 255 whatever the targets; the slow critic is a target as the two-hot of its mean, not as a
     distribution."""
-    config = config_of(run, bins=255, slow_critic_scale=1.0)
-    equal, returns, weight = np.zeros((1, 3, 255)), np.array([[0.0, -50, 1e12]]), np.array([[1.0, 0.5, 0]])
-    run.expect("critic_loss", (equal, equal, returns, weight, config), 11.082527 * weight, bound=LITERAL["float32"])
-    for arguments, loss, config in losses_towards_the_mean(run):
-        run.expect("critic_loss", (*arguments, weight, config), loss * weight, bound=LITERAL["float32"])
+    config = config_of(setting, bins=255, slow_critic_scale=1.0)
+    flat, returns, weight = np.zeros((1, 3, 255)), np.array([[0.0, -50, 1e12]]), np.array([[1.0, 0.5, 0]])
+    yield equal("critic_loss", (flat, flat, returns, weight, config), 11.082527 * weight, bound=LITERAL["float32"])
+    for arguments, loss, config in losses_towards_the_mean(setting):
+        yield equal("critic_loss", (*arguments, weight, config), loss * weight, bound=LITERAL["float32"])
 
 
 @check("BEH-12", "BEH-14", uses=["replay_critic_loss"], level=0)
-def replay_critic_loss_literals(run: Run) -> None:
+def replay_critic_loss_literals(setting: Setting) -> Cases:
     """The same, where the last step of an episode costs nothing."""
     is_last = np.array([[False, True, False]])
-    for arguments, loss, config in losses_towards_the_mean(run):
-        run.expect("replay_critic_loss", (*arguments, is_last, config), loss * (1 - is_last), bound=LITERAL["float32"])
+    for arguments, loss, config in losses_towards_the_mean(setting):
+        yield equal("replay_critic_loss", (*arguments, is_last, config), loss * (1 - is_last), bound=LITERAL["float32"])
 
 
-def losses_towards_the_mean(run: Run) -> Iterator[tuple[tuple[np.ndarray, ...], float, Config]]:
+def losses_towards_the_mean(setting: Setting) -> Iterator[tuple[tuple[np.ndarray, ...], float, Config]]:
     """Logits, slow logits and returns [1, 3], and the loss of each entry, for several shares of the slow critic."""
     slow = np.full((1, 3, 255), -1e4)
     slow[..., 127] = slow[..., 129] = 0
@@ -249,100 +250,102 @@ def losses_towards_the_mean(run: Run) -> Iterator[tuple[tuple[np.ndarray, ...], 
     c = math.log(253 + math.exp(8) + math.exp(16))
     towards_slow = 0.927147 * (c - 8) + 0.072853 * (c - 16)
     for share in (1.0, 0.25, 0.0):
-        config = config_of(run, bins=255, slow_critic_scale=share, critic_scale=5.0, replay_critic_scale=7.0)
-        yield (logits, run.cast(slow), np.zeros((1, 3))), c + share * towards_slow, config
+        config = config_of(setting, bins=255, slow_critic_scale=share, critic_scale=5.0, replay_critic_scale=7.0)
+        yield (logits, setting.cast(slow), np.zeros((1, 3))), c + share * towards_slow, config
 
 
 @check("BEH-12", "BEH-17", "BEH-22", uses=["critic_loss"], level=0)
-def critic_loss_matches(run: Run) -> None:
+def critic_loss_matches(setting: Setting) -> Cases:
     """Every entry on its own, over the bins of the configuration, for returns of any size."""
-    compare_critic_losses(run, "critic_loss")
+    yield from critic_losses(setting, "critic_loss")
 
 
 @check("BEH-12", "BEH-14", "BEH-17", "BEH-22", uses=["replay_critic_loss"], level=0)
-def replay_critic_loss_matches(run: Run) -> None:
+def replay_critic_loss_matches(setting: Setting) -> Cases:
     """The same, for flags of any type."""
-    compare_critic_losses(run, "replay_critic_loss")
+    yield from critic_losses(setting, "replay_critic_loss")
 
 
-def compare_critic_losses(run: Run, function: str) -> None:
-    @run.for_all(
+def critic_losses(setting: Setting, function: str) -> Cases:
+    def case(seed: int, bins: int, slow_scale: float, flags: type) -> Cases:
+        config = config_of(setting, bins=bins, slow_critic_scale=slow_scale, critic_scale=5.0, replay_critic_scale=7.0)
+        rng = np.random.default_rng(seed)
+        logits = value_logits(setting, seed, (4, 3), bins, slow=False)
+        slow = value_logits(setting, seed + 1, (4, 3), bins, slow=True)
+        returns = setting.cast(rng.normal(size=(4, 3)) * 10 ** rng.uniform(-3, 9, (4, 3)))
+        weight = setting.cast(rng.random((4, 3)))
+        is_last: np.ndarray = (rng.random((4, 3)) < 0.4).astype(flags)
+        size = (bins + 64) * (2 + np.ptp(logits, -1)) * (2 + np.ptp(slow, -1))
+        entries, magnitude = (weight, size * weight) if function == "critic_loss" else (is_last, size)
+        arguments = (logits, slow, returns, entries, config)
+        yield equal(function, arguments, getattr(reference, function)(*arguments), magnitude=magnitude, bound=setting.u)
+
+    yield Drawn(
+        case,
         seed=seeds(),
         bins=st.sampled_from([31, 255]),
         slow_scale=st.sampled_from([0.5, 1.0]),
         flags=st.sampled_from([bool, float]),
     )
-    def _(seed: int, bins: int, slow_scale: float, flags: type) -> None:
-        config = config_of(run, bins=bins, slow_critic_scale=slow_scale, critic_scale=5.0, replay_critic_scale=7.0)
-        rng = np.random.default_rng(seed)
-        logits, slow = value_logits(run, seed, (4, 3), bins, False), value_logits(run, seed + 1, (4, 3), bins, True)
-        returns = run.cast(rng.normal(size=(4, 3)) * 10 ** rng.uniform(-3, 9, (4, 3)))
-        weight = run.cast(rng.random((4, 3)))
-        is_last: np.ndarray = (rng.random((4, 3)) < 0.4).astype(flags)
-        size = (bins + 64) * (2 + np.ptp(logits, -1)) * (2 + np.ptp(slow, -1))
-        entries, magnitude = (weight, size * weight) if function == "critic_loss" else (is_last, size)
-        arguments = (logits, slow, returns, entries, config)
-        run.expect(function, arguments, getattr(reference, function)(*arguments), magnitude=magnitude, bound=run.u)
 
 
 @check("BEH-16", "BEH-17", uses=["losses"], level=2, dtypes=WHOLE)
-def the_slow_critic_only_regularizes(run: Run) -> None:
+def the_slow_critic_only_regularizes(setting: Setting) -> Cases:
     """Another slow critic changes the two critic losses and nothing else, and with `slow_critic_scale` 0 not even
     these."""
-    problem = problem_of(run, "vector", "discrete")
+    problem = problem_of(setting, "vector", "discrete")
     params, slow, *rest, config = problem.loss_arguments
     other = {name: value * 0.5 for name, value in slow.items()}
-    _, before = run.call("losses", params, slow, *rest, config)
-    _, after = run.call("losses", params, other, *rest, config)
-    for name, value in before["losses"].items():
-        if name in ("critic", "replay_critic"):
-            run.holds(f"{name} depends on the slow critic", abs(float(value) - float(after["losses"][name])) > 1e-3)
-        else:
-            run.exact(name, after["losses"][name], value)
-    for name, value in before["metrics"].items():
-        run.exact(name, after["metrics"][name], value)
-    alone = config_of(run, slow_critic_scale=0.0)
-    losses = [run.call("losses", params, critic, *rest, alone)[1]["losses"] for critic in (slow, other)]
-    run.exact(
-        "critic losses without the regularizer", [losses[0][n] for n in losses[0]], [losses[1][n] for n in losses[0]]
-    )
+
+    def regularizes(c: Comparisons, before: Any, after: Any) -> None:
+        before, after = before[1], after[1]
+        for name, value in before["losses"].items():
+            if name in ("critic", "replay_critic"):
+                difference = abs(float(value) - float(after["losses"][name]))
+                c.holds(f"{name} depends on the slow critic", difference > 1e-3)
+            else:
+                c.exact(name, after["losses"][name], value)
+        for name, value in before["metrics"].items():
+            c.exact(name, after["metrics"][name], value)
+
+    yield related(regularizes, *(("losses", (params, critic, *rest, config)) for critic in (slow, other)))
+
+    def same(c: Comparisons, before: Any, after: Any) -> None:
+        one, two = before[1]["losses"], after[1]["losses"]
+        c.exact("critic losses without the regularizer", [one[name] for name in one], [two[name] for name in one])
+
+    alone = config_of(setting, slow_critic_scale=0.0)
+    yield related(same, *(("losses", (params, critic, *rest, alone)) for critic in (slow, other)))
 
 
 @check("BEH-19", uses=["update_slow_critic"], level=0)
-def slow_critic_literals(run: Run) -> None:
+def slow_critic_literals(setting: Setting) -> Cases:
     """1 towards 2 with decay 0.98 is 1.02; decay 1 freezes, decay 0 copies; other parameters are ignored, arguments
     left alone."""
-    slow, params = (
-        {"critic/a": np.array([1.0, -1]), "critic/b": np.zeros((1, 2))},
-        {
-            "critic/a": np.array([2.0, -1]),
-            "critic/b": np.full((1, 2), 50.0),
-            "actor/a": np.zeros(3),
-            "slow_critic": np.zeros(1),
-        },
-    )
-    expected = {"critic/a": np.array([1.02, -1]), "critic/b": np.ones((1, 2))}
-    run.expect(
-        "update_slow_critic",
-        (slow, params, 0.98),
-        expected,
+    slow = {"critic/a": np.array([1.0, -1]), "critic/b": np.zeros((1, 2))}
+    params = {
+        "critic/a": np.array([2.0, -1]),
+        "critic/b": np.full((1, 2), 50.0),
+        "actor/a": np.zeros(3),
+        "slow_critic": np.zeros(1),
+    }
+    golden = Equal(
+        {"critic/a": np.array([1.02, -1]), "critic/b": np.ones((1, 2))},
         magnitude={"critic/a": 2.0, "critic/b": 50.0},
-        bound=4 * run.u,
+        bound=4 * setting.u,
     )
-    run.exact("slow after the update", slow["critic/a"], np.array([1.0, -1]))
+    yield judged("update_slow_critic", (slow, params, 0.98), golden, keeps=True)
     for decay, result in ((1.0, slow), (0.0, params)):
-        updated = run.call("update_slow_critic", slow, params, decay)
-        for name in slow:
-            run.exact(f"{name} with decay {decay}", updated[name], result[name])
+        updated = (exactly(result[name], at=(name,), where=f"{name} with decay {decay}") for name in slow)
+        yield judged("update_slow_critic", (slow, params, decay), *updated)
 
 
 @check("BEH-19", "CON-22", uses=["update_slow_critic"], level=0)
-def slow_critic_matches(run: Run) -> None:
+def slow_critic_matches(setting: Setting) -> Cases:
     """Small differences arrive too: float32 or better whatever the compute dtype."""
 
-    @run.for_all(seed=seeds(), decay=st.sampled_from([0.98, 0.999, 0.5]), distance=st.sampled_from([1e-3, 1.0]))
-    def _(seed: int, decay: float, distance: float) -> None:
-        stored = "float64" if run.dtype == "float64" else "float32"
+    def case(seed: int, decay: float, distance: float) -> Cases:
+        stored = "float64" if setting.dtype == "float64" else "float32"
         slow = {
             name: round_to(normals(seed + n, 3, n + 1), stored)
             for n, name in enumerate(("critic/x/kernel", "critic/x/bias"))
@@ -353,42 +356,47 @@ def slow_critic_matches(run: Run) -> None:
         }
         magnitude = {name: np.abs(value) + np.abs(params[name]) for name, value in slow.items()}
         expected = reference.update_slow_critic(slow, params, decay)
-        run.expect("update_slow_critic", (slow, params, decay), expected, magnitude=magnitude, bound=4 * run.u)
+        yield equal("update_slow_critic", (slow, params, decay), expected, magnitude=magnitude, bound=4 * setting.u)
+
+    yield Drawn(case, seed=seeds(), decay=st.sampled_from([0.98, 0.999, 0.5]), distance=st.sampled_from([1e-3, 1.0]))
 
 
 @check("BEH-20", uses=["update_slow_critic"], level=0)
-def slow_critic_refuses_other_names(run: Run) -> None:
+def slow_critic_refuses_other_names(setting: Setting) -> Cases:
     """A missing or additional critic parameter, or another shape, is refused."""
     a, b = np.zeros(2), np.zeros((2, 3))
-    run.refuses("update_slow_critic", {"critic/a": a}, {"critic/a": a, "critic/b": b}, 0.98)
-    run.refuses("update_slow_critic", {"critic/a": a, "critic/b": b}, {"critic/a": a}, 0.98)
-    run.refuses("update_slow_critic", {"critic/a": a, "actor/a": a}, {"critic/a": a, "actor/a": a}, 0.98)
+    yield refused("update_slow_critic", {"critic/a": a}, {"critic/a": a, "critic/b": b}, 0.98)
+    yield refused("update_slow_critic", {"critic/a": a, "critic/b": b}, {"critic/a": a}, 0.98)
+    yield refused("update_slow_critic", {"critic/a": a, "actor/a": a}, {"critic/a": a, "actor/a": a}, 0.98)
     for wrong in (np.zeros(1), np.zeros(3), np.zeros((1, 2)), np.zeros(())):
-        run.refuses("update_slow_critic", {"critic/a": wrong}, {"critic/a": a}, 0.98)
+        yield refused("update_slow_critic", {"critic/a": wrong}, {"critic/a": a}, 0.98)
 
 
 @check("BEH-24", uses=["actor_loss", "critic_loss", "replay_critic_loss"], level=0)
-def behavior_does_not_hide_nan(run: Run) -> None:
+def behavior_does_not_hide_nan(setting: Setting) -> Cases:
     """A NaN shows at its position, also where the weight is 0 or the step is the last, and nowhere else."""
-    config = config_of(run)
+    config = config_of(setting)
     spoiled, zeros = np.array([[0.0, np.nan], [0, 0]]), np.zeros((2, 2))
+    logits = np.zeros((2, 2, config.bins))
+    broken = logits.copy()
+    broken[0, 1, 3] = np.nan
+
+    def shows(c: Comparisons, loss: np.ndarray) -> None:
+        c.exact("where the loss is NaN", np.isnan(loss), np.isnan(spoiled))
+
     for weight in (zeros, np.ones((2, 2))):
         for place in range(5):
             arrays = [spoiled if place == i else weight if i == 4 else zeros for i in range(5)]
-            run.exact("actor_loss", np.isnan(run.call("actor_loss", *arrays, 1.0, config)), np.isnan(spoiled))
-        logits = np.zeros((2, 2, config.bins))
-        broken = logits.copy()
-        broken[0, 1, 3] = np.nan
+            yield judged("actor_loss", (*arrays, 1.0, config), shows)
         for arguments in ((broken, logits, zeros), (logits, broken, zeros), (logits, logits, spoiled)):
             for function in ("critic_loss", "replay_critic_loss"):
-                loss = run.call(function, *arguments, weight, config)
-                run.exact(function, np.isnan(loss), np.isnan(spoiled))
+                yield judged(function, (*arguments, weight, config), shows)
 
 
 @check("BEH-23", "CON-8", uses=["sample_action", "action_log_prob", "action_entropy"], level=0)
-def actions_refuse_shapes(run: Run) -> None:
+def actions_refuse_shapes(setting: Setting) -> Cases:
     """Missing or additional keys, and outputs, noise or actions of other sizes are refused."""
-    config, outputs = config_of(run), random_outputs(run, run.seed, (2,), 1.0)
+    config, outputs = config_of(setting), random_outputs(setting, setting.seed, (2,), 1.0)
     noise, action = np.zeros((2, 6)), np.zeros((2, 9))
     wrong_outputs: list[dict[str, Any]] = [
         {key: value for key, value in outputs.items() if key != "one"},
@@ -400,26 +408,26 @@ def actions_refuse_shapes(run: Run) -> None:
         {**outputs, "one": {"logits": np.zeros(1)}},
     ]
     for wrong in wrong_outputs:
-        run.refuses("sample_action", wrong, noise, TASK, config)
-        run.refuses("action_log_prob", wrong, action, TASK, config)
-        run.refuses("action_entropy", wrong, TASK, config)
+        yield refused("sample_action", wrong, noise, TASK, config)
+        yield refused("action_log_prob", wrong, action, TASK, config)
+        yield refused("action_entropy", wrong, TASK, config)
     for shape in ((2, 5), (2, 9), (1, 6), (6,)):
-        run.refuses("sample_action", outputs, np.zeros(shape), TASK, config)
+        yield refused("sample_action", outputs, np.zeros(shape), TASK, config)
     for shape in ((2, 8), (2, 6), (1, 9), (9,)):
-        run.refuses("action_log_prob", outputs, np.zeros(shape), TASK, config)
+        yield refused("action_log_prob", outputs, np.zeros(shape), TASK, config)
 
 
 @check("BEH-23", "CON-8", uses=["actor_loss", "critic_loss", "replay_critic_loss"], level=0)
-def losses_refuse_shapes(run: Run) -> None:
+def losses_refuse_shapes(setting: Setting) -> Cases:
     """Arrays that are not all [N, H], or [N, H, bins], are refused, also where they could be broadcast."""
-    config, good = config_of(run), np.zeros((2, 3))
+    config, good = config_of(setting), np.zeros((2, 3))
     logits = np.zeros((2, 3, config.bins))
     for shape in ((2, 4), (1, 3), (2, 1), (3,), (), (2, 3, 1)):
         for place in range(5):
-            run.refuses("actor_loss", *[np.zeros(shape) if i == place else good for i in range(5)], 1.0, config)
+            yield refused("actor_loss", *[np.zeros(shape) if i == place else good for i in range(5)], 1.0, config)
         for function in ("critic_loss", "replay_critic_loss"):
-            run.refuses(function, logits, logits, np.zeros(shape), good, config)
-            run.refuses(function, logits, logits, good, np.zeros(shape), config)
+            yield refused(function, logits, logits, np.zeros(shape), good, config)
+            yield refused(function, logits, logits, good, np.zeros(shape), config)
     for wrong in (
         np.zeros((2, 3, config.bins + 2)),
         np.zeros((2, 4, config.bins)),
@@ -427,6 +435,6 @@ def losses_refuse_shapes(run: Run) -> None:
         np.zeros((3, config.bins)),
     ):
         for function in ("critic_loss", "replay_critic_loss"):
-            run.refuses(function, wrong, logits, good, good, config)
-            run.refuses(function, logits, wrong, good, good, config)
-    run.refuses("actor_loss", good, good, good, good, good, np.ones(2), config)
+            yield refused(function, wrong, logits, good, good, config)
+            yield refused(function, logits, wrong, good, good, config)
+    yield refused("actor_loss", good, good, good, good, good, np.ones(2), config)
