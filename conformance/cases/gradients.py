@@ -7,8 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from conformance.case import Cases, Equal, Setting, judged, related
 from conformance.cases.agent import SAMPLING_MARGIN, WHOLE, bound_of
-from conformance.check import Run, check
+from conformance.check import check
+from conformance.compare import Comparisons
 from conformance.problems import Problem, make_problem, with_sampling_margin
 from reference_numpy import agent
 from reference_numpy.transforms import exponential_bins, twohot
@@ -36,10 +38,10 @@ def masked_problem(seed: int, profile: str, dtype: str) -> Problem:
 @check(
     "DIS-2", "DIS-4", "DIS-9", "DIS-12", "DIS-14", "DIS-21", "BEH-7", uses=["loss_derivatives"], level=2, dtypes=WHOLE
 )
-def impossible_classes_have_finite_gradients(run: Run) -> None:
+def impossible_classes_have_finite_gradients(setting: Setting) -> Cases:
     """Every loss has its finite derivative where a latent and an action have classes of probability 0."""
-    problem = masked_problem(run.seed, run.profile, run.dtype)
-    params, rng = problem.state["params"], run.rng()
+    problem = masked_problem(setting.seed, setting.profile, setting.dtype)
+    params, rng = problem.state["params"], setting.rng()
     directions = [{name: rng.normal(size=value.shape) / 16 for name, value in params.items()} for _ in range(3)]
     names = list(agent.losses(*problem.loss_arguments)[1]["losses"])
 
@@ -48,40 +50,37 @@ def impossible_classes_have_finite_gradients(run: Run) -> None:
         return np.array([losses[name] for name in names])
 
     expected = np.array([agent.directional_derivative(means, params, direction, 1e-5) for direction in directions]).T
-    actual = run.call("loss_derivatives", *problem.loss_arguments, directions)
-    for name, derivatives in zip(names, expected, strict=True):
-        magnitude = np.abs(derivatives).max() + 1e-3
-        run.compare(
-            f"derivative of {name}", actual[name], derivatives, magnitude=magnitude, bound=bound_of(run, 1e-6, 5e-3)
-        )
+    bound = bound_of(setting, 1e-6, 5e-3)
+    demands = [
+        Equal(x, (name,), where=f"derivative of {name}", magnitude=np.abs(x).max() + 1e-3, bound=bound)
+        for name, x in zip(names, expected, strict=True)
+    ]
+    yield judged("loss_derivatives", (*problem.loss_arguments, directions), *demands)
 
 
 @check("DIS-14", "DIS-17", uses=["loss_derivatives"], level=2, dtypes=WHOLE)
-def constant_outputs_have_the_gradients_of_the_chapter(run: Run) -> None:
+def constant_outputs_have_the_gradients_of_the_chapter(setting: Setting) -> Cases:
     """The derivative of the continue loss is sigmoid - target at the logits 0, 800 and -800; that of the reward loss
     softmax - two-hot."""
-    problem = make_problem(run.seed, run.profile, "vector", "discrete", run.dtype)
-    config, along = problem.config, run.rng().normal(size=problem.config.bins)
+    problem = make_problem(setting.seed, setting.profile, "vector", "discrete", setting.dtype)
+    config, along = problem.config, setting.rng().normal(size=problem.config.bins)
     directions = [{"continue/out/bias": np.ones(1)}, {"reward/out/bias": along}]
     target = continue_target(problem.batch["is_terminal"], config).mean()
     weights = twohot(problem.batch["reward"], exponential_bins(config.bins)).mean((0, 1))
+    of_reward = (1 / config.bins - weights) @ along
     for logit, probability in ((0.0, 0.5), (800.0, 1.0), (-800.0, 0.0)):
         params = dict(problem.state["params"])
         for name in ("continue/out/kernel", "reward/out/kernel", "reward/out/bias"):
             params[name] = np.zeros_like(params[name])
         params["continue/out/bias"] = np.array([logit])
-        actual = run.call("loss_derivatives", params, *problem.loss_arguments[1:], directions)
-        for name, expected in (
-            ("continue", [probability - target, 0]),
-            ("reward", [0, (1 / config.bins - weights) @ along]),
-        ):
-            run.compare(
-                f"derivative of {name}",
-                actual[name],
-                np.array(expected),
-                magnitude=1.0,
-                bound=bound_of(run, 1e-6, 1e-5),
+        demands = [
+            Equal(x, (name,), where=f"derivative of {name}", magnitude=1.0, bound=bound_of(setting, 1e-6, 1e-5))
+            for name, x in (
+                ("continue", np.array([probability - target, 0])),
+                ("reward", np.array([0, of_reward])),
             )
+        ]
+        yield judged("loss_derivatives", (params, *problem.loss_arguments[1:], directions), *demands)
 
 
 @functools.lru_cache(maxsize=8)
@@ -95,46 +94,48 @@ def problem_without_epsilon(seed: int, profile: str, dtype: str) -> Problem:
 
 
 @check("LAY-4", "LAY-8", uses=["loss_derivatives"], level=2, dtypes=WHOLE)
-def normalized_layers_have_no_gradient_along_themselves(run: Run) -> None:
+def normalized_layers_have_no_gradient_along_themselves(setting: Setting) -> Cases:
     """A norm undoes longer kernels and biases, so no loss changes along them: the gradient passes through the mean
     square too."""
-    problem = problem_without_epsilon(run.seed, run.profile, run.dtype)
+    problem = problem_without_epsilon(setting.seed, setting.profile, setting.dtype)
     params = problem.state["params"]
     layers = [name.removesuffix("/scale") for name in params if name.endswith("/scale") and "stem" not in name]
     along = {f"{layer}/{part}": params[f"{layer}/{part}"] / 16 for layer in layers for part in ("kernel", "bias")}
     across = {f"{layer}/scale": params[f"{layer}/scale"] / 16 for layer in layers}
-    actual = run.call("loss_derivatives", *problem.loss_arguments, [along, across])
-    for name in agent.losses(*problem.loss_arguments)[1]["losses"]:
-        zero, size = actual[name]
-        run.compare(f"derivative of {name}", zero, 0.0, magnitude=abs(size) + 0.1, bound=bound_of(run, 1e-6, 1e-3))
+    names = list(agent.losses(*problem.loss_arguments)[1]["losses"])
+
+    def flat(c: Comparisons, actual: Any) -> None:
+        for name in names:
+            zero, size = actual[name]
+            bound = bound_of(setting, 1e-6, 1e-3)
+            c.compare(f"derivative of {name}", zero, 0.0, magnitude=abs(size) + 0.1, bound=bound)
+
+    yield judged("loss_derivatives", (*problem.loss_arguments, [along, across]), flat)
 
 
 @check("LAY-12", uses=["gradients"], level=2, dtypes=WHOLE)
-def the_first_of_equal_pixels_has_the_gradient(run: Run) -> None:
+def the_first_of_equal_pixels_has_the_gradient(setting: Setting) -> Cases:
     """Where the four pixels of every window are equal, the gradient is the one that holds nearby, where the first is a
     little larger.
 
     The image repeats a 2x2 pattern and the first layer sees only its middle tap, so its output is the same at every
     window, and the gradient of that tap is the pixel that was chosen, times what comes from above.
     """
-    problem = make_problem(
-        run.seed,
-        run.profile,
-        "image",
-        "discrete",
-        run.dtype,
-        cnn_sampling="pooled",
-        cnn_outer=False,
-        cnn_multipliers=(1, 2, 4),
-    )
+    pooled = {"cnn_sampling": "pooled", "cnn_outer": False, "cnn_multipliers": (1, 2, 4)}
+    problem = make_problem(setting.seed, setting.profile, "image", "discrete", setting.dtype, **pooled)
     pattern = np.array([[240, 30], [100, 5]], np.uint8)
     batch = {**problem.batch, "image": np.tile(pattern[..., None], (*problem.batch["reward"].shape, 8, 16, 3))}
     kernel = "encoder/image/conv0/kernel"
     middle = np.zeros_like(problem.state["params"][kernel])
     middle[2, 2] = np.abs(problem.state["params"][kernel][2, 2])
-    gradients = []
+
+    def same(c: Comparisons, equal: Any, nearby: Any) -> None:
+        chosen, expected = (np.asarray(gradients[kernel])[2, 2] for gradients in (equal, nearby))
+        c.compare("gradient of the middle tap", chosen, expected, magnitude="tensor", bound=1e-2)
+
+    calls = []
     for size in (0.0, 1e-5):
         state = {**problem.state, "params": {**problem.state["params"], kernel: size * middle}}
         changed = dataclasses.replace(problem, state=state, batch=batch)
-        gradients.append(np.asarray(run.call("gradients", *changed.loss_arguments)[kernel])[2, 2])
-    run.compare("gradient of the middle tap", gradients[0], gradients[1], magnitude="tensor", bound=1e-2)
+        calls.append(("gradients", changed.loss_arguments))
+    yield related(same, *calls)
