@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -209,16 +209,20 @@ def step_is(setting: Setting, where: str, expected: Any, state: Any) -> Iterator
     yield from latents_are(aux, where, bound)
 
 
-def step_follows(setting: Setting, where: str, problem: Problem) -> Callable[[Comparisons, Any, Any], None]:
-    """The relation of a train step to the candidate's own gradients."""
+def follows(problem: Problem, demands: Callable[[Any], Iterable[Equal]]) -> Callable[[Comparisons, Any, Any], None]:
+    """The relation of a train step to the candidate's own gradients. demands: of the step, made of the reference's."""
 
     def relation(c: Comparisons, gradients: Any, actual: Any) -> None:
         inputs = (problem.state, problem.batch, problem.noise, gradients, problem.spaces, problem.config)
-        for demand in step_is(setting, where, reference.train_step(*inputs), problem.state):
+        for demand in demands(reference.train_step(*inputs)):
             how = {"magnitude": demand.magnitude, "bound": demand.bound}
             c.compare(demand.where, part_of(actual, demand.at), demand.expected, **how)
 
     return relation
+
+
+def step_follows(setting: Setting, where: str, problem: Problem) -> Callable[[Comparisons, Any, Any], None]:
+    return follows(problem, lambda expected: step_is(setting, where, expected, problem.state))
 
 
 STEP = ("AGT-29", "AGT-30", "BEH-21", "OPT-17", "OPT-21")
