@@ -138,11 +138,11 @@ def run(
 ) -> None:
     """Runs a check to its end or to its first deviation, which is raised. adapter: the candidate that `ask` asks."""
     any_error = bool(getattr(adapter, "refuses_anyhow", False))
-    if check.cases is not None:
-        judge_cases(check.cases, setting, ask, comparisons, ordinary=ordinary, shrink=shrink, any_error=any_error)
-    else:
-        assert check.script is not None
-        with ordinary_numbers(ordinary):
+    with np.errstate(all="ignore"), ordinary_numbers(ordinary):
+        if check.cases is not None:
+            judge_cases(check.cases, setting, ask, comparisons, ordinary=ordinary, shrink=shrink, any_error=any_error)
+        else:
+            assert check.script is not None
             check.script(Script(setting, ask, comparisons, shrink, any_error, refusals=not ordinary))
 
 
