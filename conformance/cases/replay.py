@@ -10,14 +10,11 @@ from typing import Any
 import hypothesis.strategies as st
 import numpy as np
 
-from conformance.check import Run, check
+from conformance.check import script
+from conformance.ledger import LATENTS, Arrays, Ledger, record
+from conformance.script import Script
 from conformance.strategies import seeds
 
-Record = dict[str, np.ndarray]
-Arrays = dict[str, np.ndarray]
-Item = tuple[int, int]
-
-LATENTS = ("deter", "stoch")
 TYPES = {
     "x": "float32",
     "image": "uint8",
@@ -34,24 +31,8 @@ TYPES = {
 REQUIRED = ("reward", "is_first", "is_last", "is_terminal", "action", *LATENTS)
 
 
-def record(n: int, worker: int = 0, **changes: Any) -> Record:
-    values: Record = {
-        "x": np.array([n, worker], np.float32),
-        "image": np.full((2, 3, 1), (7 * n + worker) % 256, np.uint8),
-        "mode": np.array([n % 3], np.int64),
-        "reward": np.array(0.5 * n, np.float32),
-        "is_first": np.array(n == 0),
-        "is_last": np.array(False),
-        "is_terminal": np.array(False),
-        "action": np.array([10 * n, -n], np.float32),
-        "deter": np.array([n, 1000 + n, 1 / (n + 1)], np.float32),
-        "stoch": np.array([n % 64, (n + 1) % 64], np.int32),
-    }
-    return values | changes
-
-
-def filled(run: Run, records: int, capacity: int = 100, length: int = 2, workers: int = 1) -> Any:
-    replay = run.call("Replay", capacity, length)
+def filled(script: Script, records: int, capacity: int = 100, length: int = 2, workers: int = 1) -> Any:
+    replay = script.call("Replay", capacity, length)
     for n in range(records):
         for worker in range(workers):
             replay.add(record(n, worker), worker)
@@ -74,117 +55,45 @@ def contexts(replay: Any, uniform: list[float]) -> list[float]:
     return np.asarray(replay.sample(uniform, online=False)["deter"])[:, 0].tolist()
 
 
-def refuses(run: Run, words: tuple[str, ...], function: Callable[..., Any], *args: Any) -> None:
+def refuses(script: Script, words: tuple[str, ...], function: Callable[..., Any], *args: Any) -> None:
     """Holds if the call raises a ValueError whose message contains the words."""
     try:
         function(*args)
     except ValueError as error:
-        run.holds(
-            f"the message {str(error)!r} names {words}", bool(str(error)) and all(word in str(error) for word in words)
-        )
+        message = str(error)
+        script.holds(f"the message {message!r} names {words}", bool(message) and all(word in message for word in words))
         return
-    run.holds(f"a ValueError of {function.__name__} that names {words}", False)
+    script.holds(f"a ValueError of {function.__name__} that names {words}", False)
 
 
-class Ledger:
-    """The buffer by its definition: all records for ever, and plain lists. Slow, and nothing like an implementation."""
-
-    def __init__(self, length: int) -> None:
-        self.length = length
-        self.streams: list[list[Record]] = []
-        self.current: dict[int, int] = {}
-        self.items: list[Item] = []
-        self.queue: list[Item] = []
-
-    def add(self, step: Record, worker: int, capacity: int) -> None:
-        if worker not in self.current:
-            self.current[worker] = len(self.streams)
-            self.streams.append([])
-        number = self.current[worker]
-        self.streams[number].append({key: np.array(value) for key, value in step.items()})
-        n = len(self.streams[number]) - 1
-        if n >= self.length:
-            self.items = [*self.items, (number, n - self.length)][-capacity:]
-            if n % (self.length + 1) == 0:
-                self.queue.append((number, n - self.length))
-
-    def held(self, number: int, position: int) -> bool:
-        if number >= len(self.streams) or not 0 <= position < len(self.streams[number]):
-            return False
-        open_ = number in self.current.values() and position >= len(self.streams[number]) - self.length
-        return open_ or any((number, position - i) in self.items for i in range(self.length + 1))
-
-    def choose(self, uniform: np.ndarray, online: bool) -> list[Item]:
-        chosen = []
-        for u in uniform:
-            self.queue = [item for item in self.queue if item in self.items] if online else self.queue
-            chosen.append(self.queue.pop(0) if online and self.queue else self.items[int(u * len(self.items))])
-        return chosen
-
-    def batch(self, chosen: list[Item]) -> Arrays:
-        rows = [self.streams[number][start : start + self.length + 1] for number, start in chosen]
-        batch = {
-            key: np.array([[step[key] for step in row[1:]] for row in rows]) for key in rows[0][0] if key not in LATENTS
-        }
-        batch["prev_action"] = np.array([[step["action"] for step in row[:-1]] for row in rows])
-        del batch["action"]
-        for row, b in zip(rows, range(len(rows)), strict=True):
-            for t in range(1, self.length):
-                batch["is_last"][b, t - 1] = row[t]["is_last"] or row[t + 1]["is_first"]
-        return {**batch, **{key: np.array([row[0][key] for row in rows]) for key in LATENTS}, "ids": np.array(chosen)}
-
-    def write_back(self, ids: np.ndarray, fresh: Arrays) -> None:
-        for row, (number, start) in enumerate(ids.tolist()):
-            for t in range(self.length):
-                if self.held(number, start + 1 + t):
-                    self.streams[number][start + 1 + t] |= {key: fresh[key][row, t] for key in LATENTS}
-
-    def state(self) -> Arrays:
-        table = []
-        for number in sorted({number for number, _ in self.items}):
-            positions = [start for owner, start in self.items if owner == number]
-            table.append((number, positions[0], len(positions) + self.length))
-        records = [step for number, first, count in table for step in self.streams[number][first : first + count]]
-        return {
-            "length": np.array(self.length),
-            "next_stream": np.array(len(self.streams)),
-            "streams": np.array(table).reshape(-1, 3),
-            "items": np.array(self.items).reshape(-1, 2),
-            **{f"records/{key}": np.array([step[key] for step in records]) for key in (records[0] if records else {})},
-        }
-
-    def restart(self, capacity: int) -> None:
-        self.current, self.queue, self.items = {}, [], self.items[-capacity:]
-
-
-def compare_arrays(run: Run, where: str, actual: Any, expected: Arrays) -> None:
-    run.holds(f"{where}: keys {sorted(actual)}", set(actual) == set(expected))
+def compare_arrays(script: Script, where: str, actual: Any, expected: Arrays) -> None:
+    script.holds(f"{where}: keys {sorted(actual)}", set(actual) == set(expected))
     for key, value in expected.items():
-        run.exact(f"{where}[{key}]", actual[key], value)
+        script.exact(f"{where}[{key}]", actual[key], value)
 
 
-@check(*(f"REP-{n}" for n in range(1, 27) if n not in (6, 13)), uses=["Replay"], level=0)
-def histories_match_the_definition(run: Run) -> None:
+@script(*(f"REP-{n}" for n in range(1, 27) if n not in (6, 13)), uses=["Replay"], level=0)
+def histories_match_the_definition(script: Script) -> None:
     """Whatever is added, drawn, written back, saved and loaded by several workers in any order follows from the list of
     all records."""
 
-    @run.for_all(
+    @script.for_all(
         seed=seeds(), length=st.integers(1, 4), capacity=st.sampled_from([1, 2, 7, 20]), workers=st.integers(1, 3)
     )
     def _(seed: int, length: int, capacity: int, workers: int) -> None:
         rng = np.random.default_rng(seed)
-        replay, ledger, drawn = run.call("Replay", capacity, length), Ledger(length), [np.zeros((1, 2), np.int64)]
+        replay, ledger, drawn = script.call("Replay", capacity, length), Ledger(length), [np.zeros((1, 2), np.int64)]
         for n in range(80):
             worker = int(rng.integers(workers)) * 7
             flags = {name: np.array(rng.random() < 0.2) for name in ("is_first", "is_last", "is_terminal")}
             step = record(n, worker, **flags)
             replay.add(step, worker)
             ledger.add(step, worker, capacity)
-            run.exact("len", len(replay), len(ledger.items))
+            script.exact("len", len(replay), len(ledger.items))
             if len(replay) and rng.random() < 0.4:
                 uniform, online = rng.random(3), bool(rng.random() < 0.7)
                 batch = replay.sample(uniform, online=online)
-                compare_arrays(run, "sample", batch, ledger.batch(ledger.choose(uniform, online)))
+                compare_arrays(script, "sample", batch, ledger.batch(ledger.choose(uniform, online)))
                 drawn.append(np.array(batch["ids"]))
             if rng.random() < 0.3:
                 ids = drawn[int(rng.integers(len(drawn)))]
@@ -197,56 +106,45 @@ def histories_match_the_definition(run: Run) -> None:
             if n in (25, 60):
                 state = replay.state_dict()
                 expected = ledger.state()
-                run.holds("the records of a state", set(expected) <= set(state))
-                compare_arrays(run, "state", {key: state[key] for key in expected}, expected)
+                script.holds("the records of a state", set(expected) <= set(state))
+                compare_arrays(script, "state", {key: state[key] for key in expected}, expected)
                 capacity = max(1, capacity - n // 20)
-                replay = run.call("Replay", capacity, length)
+                replay = script.call("Replay", capacity, length)
                 replay.load_state_dict(state)
                 ledger.restart(capacity)
-                run.exact("len after loading", len(replay), len(ledger.items))
+                script.exact("len after loading", len(replay), len(ledger.items))
 
 
-@check(
-    "REP-2",
-    "REP-4",
-    "REP-5",
-    "REP-7",
-    "REP-8",
-    "REP-12",
-    "REP-14",
-    "REP-15",
-    "REP-18",
-    "REP-20",
-    "REP-22",
-    uses=["Replay"],
-    level=0,
-)
-def a_small_buffer_by_hand(run: Run) -> None:
+BY_HAND = ("REP-2", "REP-4", "REP-5", "REP-7", "REP-8", "REP-12", "REP-14", "REP-15", "REP-18", "REP-20", "REP-22")
+
+
+@script(*BY_HAND, uses=["Replay"], level=0)
+def a_small_buffer_by_hand(script: Script) -> None:
     """T = 2, capacity 3, records 0 to 5: row 0 comes from the queue, row 1 is drawn, and record 3 keeps the latents of
     row 1."""
-    replay = filled(run, 6, capacity=3)
-    run.exact("len", len(replay), 3)
+    replay = filled(script, 6, capacity=3)
+    script.exact("len", len(replay), 3)
     batch = replay.sample([0.0, 0.5])
-    run.exact("ids", batch["ids"], [[0, 1], [0, 2]])
-    run.exact("x", batch["x"][..., 0], [[2, 3], [3, 4]])
-    run.exact("prev_action", batch["prev_action"][..., 0], [[10, 20], [20, 30]])
-    run.exact("deter", batch["deter"][:, :2], [[1, 1001], [2, 1002]])
-    run.exact("stoch", batch["stoch"], [[1, 2], [2, 3]])
+    script.exact("ids", batch["ids"], [[0, 1], [0, 2]])
+    script.exact("x", batch["x"][..., 0], [[2, 3], [3, 4]])
+    script.exact("prev_action", batch["prev_action"][..., 0], [[10, 20], [20, 30]])
+    script.exact("deter", batch["deter"][:, :2], [[1, 1001], [2, 1002]])
+    script.exact("stoch", batch["stoch"], [[1, 2], [2, 3]])
     fresh = latents(2, 2, 5.0)
     fresh["deter"][1] = 6.0
     replay.write_back(batch["ids"], fresh)
-    run.exact("latents of records 1, 2 and 3", contexts(replay, [0.0, 0.4, 0.9]), [1, 5, 6])
+    script.exact("latents of records 1, 2 and 3", contexts(replay, [0.0, 0.4, 0.9]), [1, 5, 6])
 
 
-@check("REP-14", "REP-19", uses=["Replay"], level=0)
-def entries_and_types_of_a_batch(run: Run) -> None:
+@script("REP-14", "REP-19", uses=["Replay"], level=0)
+def entries_and_types_of_a_batch(script: Script) -> None:
     """A batch has exactly the entries of the chapter in their types; observations keep theirs, and deter keeps every
     bit of float32."""
-    replay = filled(run, 9, length=3)
+    replay = filled(script, 9, length=3)
     batch = replay.sample([0.0, 0.3, 0.9, 0.2])
-    run.holds(f"the entries {sorted(batch)}", set(batch) == set(TYPES))
+    script.holds(f"the entries {sorted(batch)}", set(batch) == set(TYPES))
     for key, dtype in TYPES.items():
-        run.holds(f"{key} has the type {dtype}, got {batch[key].dtype}", batch[key].dtype == dtype)
+        script.holds(f"{key} has the type {dtype}, got {batch[key].dtype}", batch[key].dtype == dtype)
     shapes = {
         "image": (4, 3, 2, 3, 1),
         "mode": (4, 3, 1),
@@ -256,73 +154,70 @@ def entries_and_types_of_a_batch(run: Run) -> None:
         "ids": (4, 2),
     }
     for key, shape in shapes.items():
-        run.holds(f"{key} has the shape {shape}, got {batch[key].shape}", batch[key].shape == shape)
-    run.exact("deter", batch["deter"][:, 2], 1 / (np.array(starts(batch)) + 1).astype(np.float32))
+        script.holds(f"{key} has the shape {shape}, got {batch[key].shape}", batch[key].shape == shape)
+    script.exact("deter", batch["deter"][:, 2], 1 / (np.array(starts(batch)) + 1).astype(np.float32))
 
 
-@check("REP-7", "REP-8", "REP-9", uses=["Replay"], level=0)
-def the_queue_of_the_paper(run: Run) -> None:
+@script("REP-7", "REP-8", "REP-9", uses=["Replay"], level=0)
+def the_queue_of_the_paper(script: Script) -> None:
     """With T = 64 the entries arrive with records 65, 130, 195 and start at 1, 66, 131: nothing is missed but record
     0."""
-    replay, served = run.call("Replay", 1000, 64), []
+    replay, served = script.call("Replay", 1000, 64), []
     for n in range(200):
         replay.add(record(n), 0)
         start = starts(replay.sample([0.0]))[0] if len(replay) else 0
         if start:  # an empty queue gives the oldest item, 0
             served.append((n, start))
-    run.exact("record that was added, start that was served", served, [(65, 1), (130, 66), (195, 131)])
-    together = filled(run, 200, capacity=1000, length=64)
-    run.exact("starts of one batch", starts(together.sample([0.0] * 5)), [1, 66, 131, 0, 0])
-    run.exact("the oldest item is served, too", starts(filled(run, 6, capacity=3).sample([0.99])), [1])
-    run.exact("evicted entries are dropped", starts(filled(run, 9, capacity=2).sample([0.0])), [5])
-    run.exact("and the next one serves the row", starts(filled(run, 10, capacity=2).sample([0.0, 0.0])), [7, 6])
+    script.exact("record that was added, start that was served", served, [(65, 1), (130, 66), (195, 131)])
+    together = filled(script, 200, capacity=1000, length=64)
+    script.exact("starts of one batch", starts(together.sample([0.0] * 5)), [1, 66, 131, 0, 0])
+    script.exact("the oldest item is served, too", starts(filled(script, 6, capacity=3).sample([0.99])), [1])
+    script.exact("evicted entries are dropped", starts(filled(script, 9, capacity=2).sample([0.0])), [5])
+    script.exact("and the next one serves the row", starts(filled(script, 10, capacity=2).sample([0.0, 0.0])), [7, 6])
 
 
-@check("REP-1", "REP-8", "REP-10", "REP-11", "REP-12", uses=["Replay"], level=0)
-def one_queue_for_all_workers(run: Run) -> None:
+@script("REP-1", "REP-8", "REP-10", "REP-11", "REP-12", uses=["Replay"], level=0)
+def one_queue_for_all_workers(script: Script) -> None:
     """Entries of two workers are served in the order in which they were queued; rows after them use the uniforms at
     their own place."""
-    replay = filled(run, 7, workers=2)  # queued with records 3 and 6
-    run.exact("offline", replay.sample([0.0, 0.99], online=False)["ids"], [[0, 0], [1, 4]])
+    replay = filled(script, 7, workers=2)  # queued with records 3 and 6
+    script.exact("offline", replay.sample([0.0, 0.99], online=False)["ids"], [[0, 0], [1, 4]])
     batch = replay.sample([0.99, 0.99, 0.0, 0.0, 0.15, 0.99])
-    run.exact("online", batch["ids"], [[0, 1], [1, 1], [0, 4], [1, 4], [1, 0], [1, 4]])
-    run.exact("workers", batch["x"][:, 0, 1], [0, 1, 0, 1, 1, 1])
+    script.exact("online", batch["ids"], [[0, 1], [1, 1], [0, 4], [1, 4], [1, 0], [1, 4]])
+    script.exact("workers", batch["x"][:, 0, 1], [0, 1, 0, 1, 1, 1])
 
 
-@check("REP-12", uses=["Replay"], level=0)
-def uniform_numbers_choose_items(run: Run) -> None:
+@script("REP-12", uses=["Replay"], level=0)
+def uniform_numbers_choose_items(script: Script) -> None:
     """Number u chooses item floor(u n) of n in float64, counted from the oldest, also when many items have been
     removed."""
     uniform = [0.0, 0.0999, 0.1, 0.5 - 2.0**-40, 0.5, 0.55, float(np.nextafter(1, 0))]
     for records, oldest in ((12, 0), (15, 3), (33, 21)):
         expected = oldest + np.array([0, 0, 1, 4, 5, 5, 9])
-        run.exact(
-            f"after {records} records",
-            starts(filled(run, records, capacity=10).sample(uniform, online=False)),
-            expected,
-        )
+        chosen = starts(filled(script, records, capacity=10).sample(uniform, online=False))
+        script.exact(f"after {records} records", chosen, expected)
 
 
-@check("REP-15", "REP-16", "REP-17", uses=["Replay"], level=0)
-def flags_inside_a_sequence(run: Run) -> None:
+@script("REP-15", "REP-16", "REP-17", uses=["Replay"], level=0)
+def flags_inside_a_sequence(script: Script) -> None:
     """An abandoned episode ends where the next one begins, except at the last position; nothing else is changed or
     masked."""
     firsts, lasts = [False, False, True, False, True], [False, False, False, True, False]
-    replay = run.call("Replay", 10, 3)
+    replay = script.call("Replay", 10, 3)
     for n in range(5):
         replay.add(
             record(n, is_first=np.array(firsts[n]), is_last=np.array(lasts[n]), is_terminal=np.array(lasts[n])), 0
         )
     batch = replay.sample([0.0, 0.9], online=False)
-    run.exact("is_first", batch["is_first"], [[False, True, False], [True, False, True]])
-    run.exact("is_last", batch["is_last"], [[True, False, True], [False, True, False]])
-    run.exact("is_terminal", batch["is_terminal"], [[False, False, True], [False, True, False]])
-    run.exact("prev_action", batch["prev_action"][..., 0], [[0, 10, 20], [10, 20, 30]])
-    run.exact("stored is_last", replay.state_dict()["records/is_last"], lasts)
+    script.exact("is_first", batch["is_first"], [[False, True, False], [True, False, True]])
+    script.exact("is_last", batch["is_last"], [[True, False, True], [False, True, False]])
+    script.exact("is_terminal", batch["is_terminal"], [[False, False, True], [False, True, False]])
+    script.exact("prev_action", batch["prev_action"][..., 0], [[0, 10, 20], [10, 20, 30]])
+    script.exact("stored is_last", replay.state_dict()["records/is_last"], lasts)
 
 
-@check("REP-6", "REP-23", uses=["Replay"], level=0)
-def nothing_shares_memory(run: Run) -> None:
+@script("REP-6", "REP-23", uses=["Replay"], level=0)
+def nothing_shares_memory(script: Script) -> None:
     """Writing into what was given to add, write_back or load_state_dict, or came from sample or state_dict, changes
     nothing."""
 
@@ -331,50 +226,50 @@ def nothing_shares_memory(run: Run) -> None:
             if np.ndim(array) and array.flags.writeable:
                 array[...] = 1
 
-    replay, given = run.call("Replay", 10, 2), [record(n) for n in range(4)]
+    replay, given = script.call("Replay", 10, 2), [record(n) for n in range(4)]
     for step in given:
         replay.add(step, 0)
         spoil(step)
     before = {key: np.array(value) for key, value in replay.sample([0.0, 0.9], online=False).items()}
-    run.exact("x after the arrays given to add were overwritten", before["x"][:, :, 0], [[1, 2], [2, 3]])
+    script.exact("x after the arrays given to add were overwritten", before["x"][:, :, 0], [[1, 2], [2, 3]])
     spoil(replay.sample([0.0, 0.9], online=False))
     spoil(replay.state_dict())
-    compare_arrays(run, "after batch and state were overwritten", replay.sample([0.0, 0.9], online=False), before)
+    compare_arrays(script, "after batch and state were overwritten", replay.sample([0.0, 0.9], online=False), before)
     fresh = latents(2, 2, 5.0)
     replay.write_back(before["ids"], fresh)
     spoil(fresh)
-    run.exact("latents after those written back were overwritten", contexts(replay, [0.0, 0.9]), [0, 5])
-    loaded, state = run.call("Replay", 10, 2), replay.state_dict()
+    script.exact("latents after those written back were overwritten", contexts(replay, [0.0, 0.9]), [0, 5])
+    loaded, state = script.call("Replay", 10, 2), replay.state_dict()
     loaded.load_state_dict(state)
     spoil(state)
-    run.exact("x after the loaded state was overwritten", loaded.sample([0.0, 0.9])["x"][:, :, 0], [[1, 2], [2, 3]])
-    run.exact("the queue after state_dict", starts(replay.sample([0.0])), [1])
+    script.exact("x after the loaded state was overwritten", loaded.sample([0.0, 0.9])["x"][:, :, 0], [[1, 2], [2, 3]])
+    script.exact("the queue after state_dict", starts(replay.sample([0.0])), [1])
 
 
-@check("REP-5", "REP-20", "REP-21", uses=["Replay"], level=0)
-def write_back_to_evicted_records(run: Run) -> None:
+@script("REP-5", "REP-20", "REP-21", uses=["Replay"], level=0)
+def write_back_to_evicted_records(script: Script) -> None:
     """Positions that are gone are skipped one by one, streams that are gone or never were altogether; the context is
     not touched."""
-    replay = filled(run, 5, capacity=3, length=3)
+    replay = filled(script, 5, capacity=3, length=3)
     ids = replay.sample([0.0], online=False)["ids"]
-    run.exact("ids", ids, [[0, 0]])
+    script.exact("ids", ids, [[0, 0]])
     for n in (5, 6, 7):
         replay.add(record(n), 0)  # items 2, 3, 4: records 0 and 1 are gone
     replay.write_back(ids, latents(1, 3, 55.0))
-    run.exact("latents of records 2 to 7", replay.state_dict()["records/deter"][:, 0], [55, 55, 4, 5, 6, 7])
+    script.exact("latents of records 2 to 7", replay.state_dict()["records/deter"][:, 0], [55, 55, 4, 5, 6, 7])
     replay.write_back(np.array([[9, 0], [0, 3]]), latents(2, 3, 8.0))
-    run.exact("latents of records 2 to 7, again", replay.state_dict()["records/deter"][:, 0], [55, 55, 8, 8, 8, 7])
-    run.exact("stoch", replay.state_dict()["records/stoch"][:, 0], [55, 55, 8, 8, 8, 7])
+    script.exact("latents of records 2 to 7, again", replay.state_dict()["records/deter"][:, 0], [55, 55, 8, 8, 8, 7])
+    script.exact("stoch", replay.state_dict()["records/stoch"][:, 0], [55, 55, 8, 8, 8, 7])
 
 
-@check("REP-23", "REP-24", "REP-25", uses=["Replay"], level=0)
-def saving_and_loading(run: Run) -> None:
+@script("REP-23", "REP-24", "REP-25", uses=["Replay"], level=0)
+def saving_and_loading(script: Script) -> None:
     """The state is plain arrays with the records that belong to items; loading replaces everything and begins new
     streams."""
-    replay = filled(run, 6, capacity=5, workers=2)
+    replay = filled(script, 6, capacity=5, workers=2)
     replay.add(record(0, 2), 2)  # stream 2 has no item
     state = replay.state_dict()
-    run.holds(
+    script.holds(
         "every entry is an array of numbers",
         [isinstance(x, np.ndarray) and x.dtype.kind in "biuf" for x in state.values()],
     )
@@ -384,60 +279,62 @@ def saving_and_loading(run: Run) -> None:
         "streams": [[0, 2, 4], [1, 1, 5]],
         "items": [[1, 1], [0, 2], [1, 2], [0, 3], [1, 3]],
     }.items():
-        run.exact(key, state[key], value)
-        run.holds(f"{key} is int64", state[key].dtype == np.int64)
-    run.exact("records", state["records/x"], [[2, 0], [3, 0], [4, 0], [5, 0], [1, 1], [2, 1], [3, 1], [4, 1], [5, 1]])
-    loaded = filled(run, 9, capacity=5)  # with items, open streams and a queue of its own
+        script.exact(key, state[key], value)
+        script.holds(f"{key} is int64", state[key].dtype == np.int64)
+    script.exact(
+        "records", state["records/x"], [[2, 0], [3, 0], [4, 0], [5, 0], [1, 1], [2, 1], [3, 1], [4, 1], [5, 1]]
+    )
+    loaded = filled(script, 9, capacity=5)  # with items, open streams and a queue of its own
     loaded.load_state_dict({key: np.array(value) for key, value in state.items()})
     uniform = [0.0, 0.25, 0.5, 0.7, 0.9]
-    compare_arrays(run, "a batch of the loaded buffer", loaded.sample(uniform), replay.sample(uniform, online=False))
+    compare_arrays(script, "a batch of the loaded buffer", loaded.sample(uniform), replay.sample(uniform, online=False))
     for n, worker in ((6, 0), (7, 0), (6, 1), (8, 0)):
         loaded.add(record(n, worker), worker)
-    run.exact("items", loaded.state_dict()["items"], [[0, 2], [1, 2], [0, 3], [1, 3], [3, 0]])
-    run.exact("saving changes nothing", starts(replay.sample([0.0])), [1])
-    empty = run.call("Replay", 2, 2)
-    empty.load_state_dict(run.call("Replay", 2, 2).state_dict())
-    run.exact("an empty state", len(empty), 0)
+    script.exact("items", loaded.state_dict()["items"], [[0, 2], [1, 2], [0, 3], [1, 3], [3, 0]])
+    script.exact("saving changes nothing", starts(replay.sample([0.0])), [1])
+    empty = script.call("Replay", 2, 2)
+    empty.load_state_dict(script.call("Replay", 2, 2).state_dict())
+    script.exact("an empty state", len(empty), 0)
 
 
-@check("REP-26", uses=["Replay"], level=0)
-def loading_into_other_buffers(run: Run) -> None:
+@script("REP-26", uses=["Replay"], level=0)
+def loading_into_other_buffers(script: Script) -> None:
     """Another length is refused; a smaller capacity keeps the newest items."""
-    state = filled(run, 8).state_dict()
-    loaded = run.call("Replay", 2, 2)
+    state = filled(script, 8).state_dict()
+    loaded = script.call("Replay", 2, 2)
     loaded.load_state_dict(state)
-    run.exact("ids", loaded.sample([0.0, 0.5])["ids"], [[0, 4], [0, 5]])
-    refuses(run, ("length",), run.call("Replay", 2, 3).load_state_dict, state)
+    script.exact("ids", loaded.sample([0.0, 0.5])["ids"], [[0, 4], [0, 5]])
+    refuses(script, ("length",), script.call("Replay", 2, 3).load_state_dict, state)
 
 
-@check("REP-13", uses=["Replay"], level=0)
-def an_empty_buffer_gives_nothing(run: Run) -> None:
+@script("REP-13", uses=["Replay"], level=0)
+def an_empty_buffer_gives_nothing(script: Script) -> None:
     """Sampling without an item raises an error."""
-    refuses(run, (), filled(run, 2).sample, [0.0])
-    refuses(run, (), filled(run, 2).sample, [0.0], False)
+    refuses(script, (), filled(script, 2).sample, [0.0])
+    refuses(script, (), filled(script, 2).sample, [0.0], False)
 
 
-@check("REP-27", uses=["Replay"], level=0)
-def bad_records_are_refused(run: Run) -> None:
+@script("REP-27", uses=["Replay"], level=0)
+def bad_records_are_refused(script: Script) -> None:
     """Missing and unknown keys and other shapes are refused with a message that names them, and leave no trace."""
     for capacity, length in ((0, 1), (1, 0), (-5, 3), (3, -5)):
-        run.refuses("Replay", capacity, length)
+        script.refuses("Replay", capacity, length)
     for key in REQUIRED:
         without = {name: value for name, value in record(0).items() if name != key}
-        refuses(run, (key,), run.call("Replay", 5, 1).add, without, 0)
+        refuses(script, (key,), script.call("Replay", 5, 1).add, without, 0)
     blind = {name: value for name, value in record(0).items() if name in REQUIRED}
-    refuses(run, ("observation",), run.call("Replay", 5, 1).add, blind, 0)
-    replay = filled(run, 2)
+    refuses(script, ("observation",), script.call("Replay", 5, 1).add, blind, 0)
+    replay = filled(script, 2)
     for key in ("x", *REQUIRED):
         without = {name: value for name, value in record(2).items() if name != key}
-        refuses(run, (key,), replay.add, without, 0)
-    refuses(run, ("extra",), replay.add, record(2, extra=np.zeros(1)), 0)
+        refuses(script, (key,), replay.add, without, 0)
+    refuses(script, ("extra",), replay.add, record(2, extra=np.zeros(1)), 0)
     shapes = {"x": (7,), "action": (7,), "image": (2, 7, 1), "reward": (7,), "deter": (7, 1)}
     for key, shape in shapes.items():
         wrong = np.zeros(shape, np.uint8 if key == "image" else np.float32)
-        refuses(run, (key, "7"), replay.add, {**record(2), key: wrong}, 0)
+        refuses(script, (key, "7"), replay.add, {**record(2), key: wrong}, 0)
     replay.add(record(2), 0)
-    run.exact("x of the records that were accepted", replay.sample([0.0])["x"][..., 0], [[1, 2]])
+    script.exact("x of the records that were accepted", replay.sample([0.0])["x"][..., 0], [[1, 2]])
 
 
 def effort(function: Callable[..., Any], *args: Any) -> tuple[int, int]:
@@ -464,8 +361,8 @@ def effort(function: Callable[..., Any], *args: Any) -> tuple[int, int]:
     return lines, min(taken)
 
 
-@check("REP-28", uses=["Replay"], level=0)
-def effort_does_not_grow_with_the_buffer(run: Run) -> None:
+@script("REP-28", uses=["Replay"], level=0)
+def effort_does_not_grow_with_the_buffer(script: Script) -> None:
     """Adding and drawing run no more code and copy no more with 10 000 items, growing or full, than with 200, within a
     factor of 2.
 
@@ -473,7 +370,7 @@ def effort_does_not_grow_with_the_buffer(run: Run) -> None:
     """
     step, efforts = record(0), []
     for capacity, records in ((200, 210), (10_000, 10_010), (20_000, 10_010)):
-        replay = run.call("Replay", capacity, 2)
+        replay = script.call("Replay", capacity, 2)
         for _ in range(records):
             replay.add(step, 0)
         efforts.append((effort(replay.add, step, 0), effort(replay.sample, [0.3, 0.9], False)))
@@ -482,13 +379,13 @@ def effort_does_not_grow_with_the_buffer(run: Run) -> None:
             ("lines", "bytes"), zip(*(entry[index] for entry in efforts), strict=True), strict=True
         ):
             message = f"{where}: {small} {unit} with 200 items, with 10 000 {full} when full and {growing} before"
-            run.holds(message, max(full, growing) <= 2 * small + 100)
+            script.holds(message, max(full, growing) <= 2 * small + 100)
 
 
-@check("REP-5", uses=["Replay"], level=0)
-def evicted_records_free_their_memory(run: Run) -> None:
+@script("REP-5", uses=["Replay"], level=0)
+def evicted_records_free_their_memory(script: Script) -> None:
     """A full buffer does not grow: 200 more records of 20 kB take the room of at most 20."""
-    replay = run.call("Replay", 8, 2)
+    replay = script.call("Replay", 8, 2)
 
     def add(records: range) -> int:
         for n in records:
@@ -503,4 +400,4 @@ def evicted_records_free_their_memory(run: Run) -> None:
         growth = add(range(50, 250)) - before
     finally:
         tracemalloc.stop()
-    run.holds(f"growth of {growth} bytes", growth <= 20 * 20_000)
+    script.holds(f"growth of {growth} bytes", growth <= 20 * 20_000)

@@ -9,144 +9,151 @@ from typing import Any
 import hypothesis.strategies as st
 import numpy as np
 
-from conformance.check import Run, check
+from conformance.case import Cases, Drawn, Equal, Setting, equal, exact, exactly, judged, refused
+from conformance.check import check, script
+from conformance.compare import Comparisons
 from conformance.problems import small_config
+from conformance.script import Script
 from conformance.strategies import seeds
 from spec import Discrete, Spaces, Vector, load_config
 
 TASK = Spaces({"x": Vector(1)}, {"turn": Vector(4), "buttons": Discrete((2, 3))})
 
 
-@check("LOOP-14", uses=["ReplayRatio"], level=0)
-def train_steps_by_hand(run: Run) -> None:
+@script("LOOP-14", uses=["ReplayRatio"], level=0)
+def train_steps_by_hand(script: Script) -> None:
     """The worked numbers of the chapter: ratio 1.5 with batches of 4 steps, and the totals at the paper's sizes."""
-    ratio = run.call("ReplayRatio", 1.5, 4)
-    run.exact("steps 10 to 18", [ratio(step) for step in range(10, 19)], [1, 0, 0, 1, 0, 0, 1, 0, 1])
-    ratio = run.call("ReplayRatio", 128.0, 1024)
-    run.exact("one worker, ratio 128", [ratio(1088), ratio(100_000)], [1, 12_364])
-    ratio = run.call("ReplayRatio", 32.0, 1024)
-    run.exact("sixteen workers, ratio 32", [ratio(2048 + k) for k in range(65)], [1, *([0] * 31 + [1]) * 2])
-    ratio = run.call("ReplayRatio", 512.0, 1024)
-    run.exact("ratio 512", [ratio(step) for step in range(5, 11)], [1, 0, 1, 0, 1, 0])
-    ratio = run.call("ReplayRatio", 1024.0, 1024)
-    run.exact("steps may stand still and jump", [ratio(5), ratio(5), ratio(6), ratio(16), ratio(16)], [1, 0, 1, 10, 0])
+    ratio = script.call("ReplayRatio", 1.5, 4)
+    script.exact("steps 10 to 18", [ratio(step) for step in range(10, 19)], [1, 0, 0, 1, 0, 0, 1, 0, 1])
+    ratio = script.call("ReplayRatio", 128.0, 1024)
+    script.exact("one worker, ratio 128", [ratio(1088), ratio(100_000)], [1, 12_364])
+    ratio = script.call("ReplayRatio", 32.0, 1024)
+    script.exact("sixteen workers, ratio 32", [ratio(2048 + k) for k in range(65)], [1, *([0] * 31 + [1]) * 2])
+    ratio = script.call("ReplayRatio", 512.0, 1024)
+    script.exact("ratio 512", [ratio(step) for step in range(5, 11)], [1, 0, 1, 0, 1, 0])
+    ratio = script.call("ReplayRatio", 1024.0, 1024)
+    script.exact(
+        "steps may stand still and jump", [ratio(5), ratio(5), ratio(6), ratio(16), ratio(16)], [1, 0, 1, 10, 0]
+    )
 
 
-@check("LOOP-14", "LOOP-15", uses=["ReplayRatio"], level=0)
-def train_steps_do_not_drift(run: Run) -> None:
+@script("LOOP-14", "LOOP-15", uses=["ReplayRatio"], level=0)
+def train_steps_do_not_drift(script: Script) -> None:
     """After any steps the sum is 1 + floor((t - t0) ratio / batch steps) with the exact value of the ratio's
     float64."""
 
-    @run.for_all(
+    @script.for_all(
         ratio=st.one_of(st.sampled_from([0.1, 0.3, 1 / 3, 7.3, 1e-7, 512.0]), st.floats(1e-3, 1e4)),
         batch=st.sampled_from([1, 3, 1024]),
         start=st.sampled_from([0, 1, 1088, 10**9]),
         stride=st.sampled_from([1, 2, 16, 10**6]),
     )
     def _(ratio: float, batch: int, start: int, stride: int) -> None:
-        counter = run.call("ReplayRatio", ratio, batch)
+        counter = script.call("ReplayRatio", ratio, batch)
         steps = [start + stride * k for k in range(200)]
         expected = [1 + (step - start) * Fraction(ratio) // batch for step in steps]
-        run.exact("train steps", np.cumsum([counter(step) for step in steps]), expected)
+        script.exact("train steps", np.cumsum([counter(step) for step in steps]), expected)
 
 
-@check("LOOP-16", uses=["ReplayRatio"], level=0)
-def no_training_and_no_way_back(run: Run) -> None:
+@script("LOOP-16", uses=["ReplayRatio"], level=0)
+def no_training_and_no_way_back(script: Script) -> None:
     """A ratio of 0 never trains, not even at the first call; a step smaller than the remembered one is refused with any
     ratio."""
-    never = run.call("ReplayRatio", 0.0, 1024)
-    run.exact("ratio 0", [never(step) for step in (0, 1, 2000, 10**7)], [0, 0, 0, 0])
-    run.holds("ratio 0 remembers no step", never.state_dict()["step"] is None)
-    counter, resumed = run.call("ReplayRatio", 1.0, 4), run.call("ReplayRatio", 0.0, 4)
+    never = script.call("ReplayRatio", 0.0, 1024)
+    script.exact("ratio 0", [never(step) for step in (0, 1, 2000, 10**7)], [0, 0, 0, 0])
+    script.holds("ratio 0 remembers no step", never.state_dict()["step"] is None)
+    counter, resumed = script.call("ReplayRatio", 1.0, 4), script.call("ReplayRatio", 0.0, 4)
     counter(10)
     resumed.load_state_dict(counter.state_dict())
     for ratio in (counter, resumed):
         try:
             ratio(9)
         except ValueError as error:
-            run.holds("the error has a message", bool(str(error)))
+            script.holds("the error has a message", bool(str(error)))
         else:
-            run.holds("step 9 after 10 is refused", False)
+            script.holds("step 9 after 10 is refused", False)
 
 
-@check("LOOP-16", "LOOP-23", uses=["ReplayRatio"], level=0)
-def a_pause_is_never_paid_for(run: Run) -> None:
+@script("LOOP-16", "LOOP-23", uses=["ReplayRatio"], level=0)
+def a_pause_is_never_paid_for(script: Script) -> None:
     """What was collected with ratio 0 gives no credit to the ratio that follows; the credit from before is kept."""
-    paying = run.call("ReplayRatio", 1.0, 1024)
+    paying = script.call("ReplayRatio", 1.0, 1024)
     paying(0), paying(1000)
-    paused = run.call("ReplayRatio", 0.0, 1024)
+    paused = script.call("ReplayRatio", 0.0, 1024)
     paused.load_state_dict(json.loads(json.dumps(paying.state_dict())))
-    run.exact("the pause", [paused(step) for step in (1000, 5000, 200_000)], [0, 0, 0])
-    run.holds(
+    script.exact("the pause", [paused(step) for step in (1000, 5000, 200_000)], [0, 0, 0])
+    script.holds(
         f"{paused.state_dict()} is step 200000, credit 1000",
         dict(paused.state_dict()) == {"step": 200_000, "credit": "1000"},
     )
     paying.load_state_dict(json.loads(json.dumps(paused.state_dict())))
-    run.exact("after it", [paying(step) for step in (200_000, 200_023, 200_024, 201_047, 201_048)], [0, 0, 1, 0, 1])
-    large = run.call("ReplayRatio", 0.0, 4)
+    script.exact("after it", [paying(step) for step in (200_000, 200_023, 200_024, 201_047, 201_048)], [0, 0, 1, 0, 1])
+    large = script.call("ReplayRatio", 0.0, 4)
     large.load_state_dict({"step": 10, "credit": "7"})
-    run.exact("a credit saved with larger batches", large(20), 0)
+    script.exact("a credit saved with larger batches", large(20), 0)
 
 
-@check("LOOP-21", "LOOP-23", uses=["ReplayRatio"], level=0)
-def the_replay_ratio_goes_on(run: Run) -> None:
+@script("LOOP-21", "LOOP-23", uses=["ReplayRatio"], level=0)
+def the_replay_ratio_goes_on(script: Script) -> None:
     """Its state is exact and survives JSON; a loaded counter goes on as the saved one does, without another first train
     step."""
-    counter = run.call("ReplayRatio", 0.5, 4)
-    run.holds("no step before the first call", counter.state_dict()["step"] is None)
+    counter = script.call("ReplayRatio", 0.5, 4)
+    script.holds("no step before the first call", counter.state_dict()["step"] is None)
     counter(100), counter(107)
-    run.holds(
+    script.holds(
         f"{counter.state_dict()} is step 107, credit 7/2", dict(counter.state_dict()) == {"step": 107, "credit": "7/2"}
     )
 
-    @run.for_all(ratio=st.sampled_from([0.3, 0.1, 32.0]), calls=st.integers(0, 5), later=st.sampled_from([0.3, 5.0]))
+    @script.for_all(ratio=st.sampled_from([0.3, 0.1, 32.0]), calls=st.integers(0, 5), later=st.sampled_from([0.3, 5.0]))
     def _(ratio: float, calls: int, later: float) -> None:
-        counters = [run.call("ReplayRatio", ratio, 7), run.call("ReplayRatio", later, 7)]
+        counters = [script.call("ReplayRatio", ratio, 7), script.call("ReplayRatio", later, 7)]
         for k in range(calls):
             counters[0](100 + 13 * k)
         saved = json.loads(json.dumps(counters[0].state_dict()))
-        counters[0] = run.call("ReplayRatio", later, 7)
+        counters[0] = script.call("ReplayRatio", later, 7)
         for counter in counters:
             counter.load_state_dict(saved)
-        run.exact("two that were loaded", *([counter(step) for step in range(180, 300)] for counter in counters))
+        script.exact("two that were loaded", *([counter(step) for step in range(180, 300)] for counter in counters))
         exact, last = Fraction(saved["credit"]), saved["step"]
         counters[0].load_state_dict(saved)
         if last is None:
-            run.exact("the first call after an early save", counters[0](180), 1)
+            script.exact("the first call after an early save", counters[0](180), 1)
         else:
-            run.exact("credit in time steps", counters[0](180), (exact + (180 - last) * Fraction(later)) // 7)
+            script.exact("credit in time steps", counters[0](180), (exact + (180 - last) * Fraction(later)) // 7)
 
 
 @check("LOOP-13", uses=["can_train"], level=0)
-def training_starts_with_enough_items(run: Run) -> None:
+def training_starts_with_enough_items(setting: Setting) -> Cases:
     """Training starts with batch size times batch length items, and a buffer that cannot hold them is refused."""
     for batch_size, batch_length in ((16, 64), (3, 5), (1, 1)):
-        config = load_config(run.profile, batch_size=batch_size, batch_length=batch_length)
+        config = load_config(setting.profile, batch_size=batch_size, batch_length=batch_length)
         needed = batch_size * batch_length
         for items, expected in ((0, False), (needed - 1, False), (needed, True), (10**6, True)):
-            run.exact(f"{items} of {needed} items", bool(run.call("can_train", items, config)), expected)
+            yield exact("can_train", (items, config), expected, where=f"{items} of {needed} items")
     for items in (0, 14, 15):
-        run.refuses("can_train", items, small_config(run.profile, batch_size=3, batch_length=5, replay_capacity=14))
-    run.exact(
-        "just enough",
-        bool(run.call("can_train", 15, small_config(run.profile, batch_size=3, batch_length=5, replay_capacity=15))),
-        True,
-    )
+        small = small_config(setting.profile, batch_size=3, batch_length=5, replay_capacity=14)
+        yield refused("can_train", items, small)
+    enough = small_config(setting.profile, batch_size=3, batch_length=5, replay_capacity=15)
+    yield exact("can_train", (15, enough), True, where="just enough")
 
 
 @check("LOOP-12", "CON-27", uses=["environment_action"], level=0)
-def environment_actions_by_hand(run: Run) -> None:
+def environment_actions_by_hand(setting: Setting) -> Cases:
     """Indices of choices, numbers clipped and scaled to the bounds, to a range 2 wide at a single one, as they are
     where there is none."""
     low, high = {"turn": np.array([0, -np.inf, 0, -2])}, {"turn": np.array([10, np.inf, np.inf, 2])}
     flat = np.array([0, 1, 0, 0, 1, 0.5, -1.7, -0.25, 1.7])  # keys in sorted order: buttons, turn
-    result = run.call("environment_action", flat, TASK, low, high)
-    run.exact("buttons", result["buttons"], [1, 2])
-    run.exact("turn", result["turn"], [7.5, -1, 0.75, 2])
-    run.holds("exactly the keys of the task", set(result) == set(TASK.actions))
-    run.holds(f"indices are int64, got {result['buttons'].dtype}", result["buttons"].dtype == np.int64)
+    buttons, turn = exactly([1, 2], ("buttons",), "buttons"), exactly([7.5, -1, 0.75, 2], ("turn",), "turn")
+
+    def has_the_keys(c: Comparisons, result: Any) -> None:
+        c.holds("exactly the keys of the task", set(result) == set(TASK.actions))
+        dtype = result["buttons"].dtype
+        c.holds(f"indices are int64, got {dtype}", dtype == np.int64)
+
+    yield judged("environment_action", (flat, TASK, low, high), buttons, turn, has_the_keys)
     ties = np.array([0.5, 0.5, 0.1, 0.3, 0.3, 0, 0.3, 5, 0])
-    run.exact("the first of equals", run.call("environment_action", ties, TASK, low, high)["buttons"], [0, 1])
+    where = "the first of equals"
+    yield exact("environment_action", (ties, TASK, low, high), [0, 1], at=("buttons",), where=where)
     one = Spaces({"x": Vector(1)}, {"a": Vector(1)})
     for number, bottom, top, expected in (
         (1.0, 0.1, 0.3, 0.3),
@@ -159,48 +166,56 @@ def environment_actions_by_hand(run: Run) -> None:
         (-1.7, -np.inf, 0.25, -1.75),
         (1.7, -0.25, np.inf, 1.75),
     ):
-        bounds = {"a": np.array([bottom])}, {"a": np.array([top])}
-        run.expect(
-            "environment_action", (np.array([number]), one, *bounds), {"a": np.array([expected])}, bound=4 * run.u
-        )
-    batch = run.call("environment_action", np.stack([[flat, ties, flat], [ties, flat, flat]]), TASK, low, high)
-    run.exact("buttons of a batch", batch["buttons"], [[[1, 2], [0, 1], [1, 2]], [[0, 1], [1, 2], [1, 2]]])
-    run.exact("turn of a batch", batch["turn"][1, 2], [7.5, -1, 0.75, 2])
+        arguments = (np.array([number]), one, {"a": np.array([bottom])}, {"a": np.array([top])})
+        yield equal("environment_action", arguments, {"a": np.array([expected])}, bound=4 * setting.u)
+
+    def last_turn(c: Comparisons, result: Any) -> None:
+        c.exact("turn of a batch", result["turn"][1, 2], [7.5, -1, 0.75, 2])
+
+    batch = np.stack([[flat, ties, flat], [ties, flat, flat]])
+    indices = [[[1, 2], [0, 1], [1, 2]], [[0, 1], [1, 2], [1, 2]]]
+    buttons = exactly(indices, ("buttons",), "buttons of a batch")
+    yield judged("environment_action", (batch, TASK, low, high), buttons, last_turn)
 
 
 @check("LOOP-12", uses=["environment_action"], level=0)
-def environment_actions_stay_within_bounds(run: Run) -> None:
+def environment_actions_stay_within_bounds(setting: Setting) -> Cases:
     """Whatever is sampled, the environment gets low + (a + 1) / 2 (high - low) of the clipped number, never outside the
     bounds."""
     one = Spaces({"x": Vector(1)}, {"a": Vector(5)})
 
-    @run.for_all(seed=seeds(), scale=st.sampled_from([0.1, 1.0, 100.0]), size=st.sampled_from([1e-3, 1.0, 1e6]))
-    def _(seed: int, scale: float, size: float) -> None:
+    def case(seed: int, scale: float, size: float) -> Cases:
         rng = np.random.default_rng(seed)
         low = np.float32(rng.normal(size=5) * size).astype(np.float64)
         high = low + np.float32(rng.random(5) * size)
         flat = rng.normal(size=(3, 5)) * scale
         expected = low + (np.clip(flat, -1, 1) + 1) / 2 * (high - low)
-        actual = run.call("environment_action", flat, one, {"a": low}, {"a": high})["a"]
-        run.compare("a", actual, expected, magnitude=np.abs(low) + np.abs(high), bound=8 * run.u)
-        run.holds("within the bounds", (np.asarray(actual) >= low) & (np.asarray(actual) <= high))
+        right = Equal(expected, ("a",), where="a", magnitude=np.abs(low) + np.abs(high), bound=8 * setting.u)
+
+        def within(c: Comparisons, result: Any) -> None:
+            c.holds("within the bounds", (np.asarray(result["a"]) >= low) & (np.asarray(result["a"]) <= high))
+
+        yield judged("environment_action", (flat, one, {"a": low}, {"a": high}), right, within)
+
+    scales, sizes = st.sampled_from([0.1, 1.0, 100.0]), st.sampled_from([1e-3, 1.0, 1e6])
+    yield Drawn(case, seed=seeds(), scale=scales, size=sizes)
 
 
 @check("LOOP-12", "CON-8", uses=["environment_action"], level=0)
-def broken_actions_are_refused(run: Run) -> None:
+def broken_actions_are_refused(setting: Setting) -> Cases:
     """A number that is not finite, wherever it is, and a flat action of another length are refused."""
     low, high = {"turn": np.zeros(4)}, {"turn": np.ones(4)}
     for index in (0, 4, 5, 8):
         for value in (np.nan, np.inf, -np.inf):
             flat = np.array([0, 1, 0, 0, 1, 0.5, -1.7, -0.25, 1.7])
             flat[index] = value
-            run.refuses("environment_action", flat, TASK, low, high)
+            yield refused("environment_action", flat, TASK, low, high)
     for size in (8, 10):
-        run.refuses("environment_action", np.zeros(size), TASK, low, high)
+        yield refused("environment_action", np.zeros(size), TASK, low, high)
 
 
 @check("LOOP-7", "LOOP-10", "CON-11", uses=["step_flags"], level=0)
-def flags_by_hand(run: Run) -> None:
+def flags_by_hand(setting: Setting) -> Cases:
     """A reset is first and nothing else; an end is last by either reason, and terminal by termination alone."""
     for reset, terminated, truncated, first, last, terminal in (
         (True, False, False, True, False, False),
@@ -213,74 +228,59 @@ def flags_by_hand(run: Run) -> None:
         expected = {"is_first": np.array(first), "is_last": np.array(last), "is_terminal": np.array(terminal)}
         for kind in (bool, np.bool_):
             arguments = (kind(reset), kind(terminated), kind(truncated))
-            run.expect("step_flags", arguments, expected, bound=1e-9)
+            yield equal("step_flags", arguments, expected, bound=1e-9)
 
 
-@check(
-    "LOOP-3",
-    "LOOP-9",
-    "LOOP-10",
-    "CON-9",
-    "CON-10",
-    "CON-27",
-    "REP-6",
-    "REP-19",
-    uses=["make_record", "step_flags"],
-    level=0,
-)
-def records_by_hand(run: Run) -> None:
+RECORD = ("LOOP-3", "LOOP-9", "LOOP-10", "CON-9", "CON-10", "CON-27", "REP-6", "REP-19")
+
+
+@script(*RECORD, uses=["make_record", "step_flags"], level=0)
+def records_by_hand(script: Script) -> None:
     """A record holds what arrived, the raw action and the latents as indices; no reward at a reset, no action at an
     end; copies."""
-    x, action, deter = (
-        np.array([4.0], np.float32),
-        np.array([1.75, -3.0], np.float32),
-        np.array([0.5, 0.25], np.float32),
-    )
-    stoch = np.eye(3)[[2, 0]]
+    x, action = np.array([4.0], np.float32), np.array([1.75, -3.0], np.float32)
+    deter, stoch = np.array([0.5, 0.25], np.float32), np.eye(3)[[2, 0]]
     plain: dict[str, Any] = {"x": [4], "reward": 2.5, "action": [1.75, -3], "deter": [0.5, 0.25], "stoch": [2, 0]}
+    types = {
+        **dict.fromkeys(("reward", "action", "deter"), "float32"),
+        **dict.fromkeys(("is_first", "is_last"), "bool"),
+    }
     for flags, changes in (
         ((False, False, False), {}),
         ((True, False, False), {"reward": 0.0}),
         ((False, True, False), {"action": [0, 0]}),
         ((False, False, True), {"action": [0, 0]}),
     ):
-        step = run.call("step_flags", *flags)
-        made = run.call("make_record", {"x": x}, 2.5, step, action, deter, stoch)
-        run.holds(f"the keys {sorted(made)}", set(made) == {*plain, *step})
+        step = script.call("step_flags", *flags)
+        made = script.call("make_record", {"x": x}, 2.5, step, action, deter, stoch)
+        script.holds(f"the keys {sorted(made)}", set(made) == {*plain, *step})
         for key, value in {**plain, **step, **changes}.items():
-            run.exact(f"{key} with the flags {flags}", made[key], value)
-        for key, dtype in {
-            "reward": "float32",
-            "action": "float32",
-            "deter": "float32",
-            "is_first": "bool",
-            "is_last": "bool",
-        }.items():
-            run.holds(f"{key} is {dtype}", made[key].dtype == dtype)
-        run.holds("stoch holds integers", made["stoch"].dtype.kind in "iu")
-    made = run.call("make_record", {"x": x}, 2.5, run.call("step_flags", False, False, False), action, deter, stoch)
+            script.exact(f"{key} with the flags {flags}", made[key], value)
+        for key, dtype in types.items():
+            script.holds(f"{key} is {dtype}", made[key].dtype == dtype)
+        script.holds("stoch holds integers", made["stoch"].dtype.kind in "iu")
+    step = script.call("step_flags", False, False, False)
+    made = script.call("make_record", {"x": x}, 2.5, step, action, deter, stoch)
     for array in (x, action, deter):
         array[...] = 9
     for key in ("x", "action", "deter"):
-        run.exact(f"{key} after the argument was overwritten", made[key], plain[key])
+        script.exact(f"{key} after the argument was overwritten", made[key], plain[key])
 
 
 @check("LOOP-24", "LOOP-25", uses=["derive_seed"], level=0)
-def seeds_by_hand(run: Run) -> None:
+def seeds_by_hand(setting: Setting) -> Cases:
     """The seeds of the chapter, and those that SHA-256 gives for any other seed, purpose and index."""
-    for seed, purpose, index, expected in (
-        (0, "parameters", 0, 589476934),
-        (0, "environment", 1, 783237557),
-        (7, "train", 1000, 1045752270),
+    for arguments, expected in (
+        ((0, "parameters", 0), 589476934),
+        ((0, "environment", 1), 783237557),
+        ((7, "train", 1000), 1045752270),
     ):
-        run.exact(f"derive_seed({seed}, {purpose}, {index})", run.call("derive_seed", seed, purpose, index), expected)
+        yield exact("derive_seed", arguments, expected, where=f"derive_seed{arguments}")
 
-    @run.for_all(
-        seed=st.integers(0, 2**40),
-        purpose=st.sampled_from(["policy", "replay", "evaluation"]),
-        index=st.integers(0, 2**40),
-    )
-    def _(seed: int, purpose: str, index: int) -> None:
+    def case(seed: int, purpose: str, index: int) -> Cases:
         first = hashlib.sha256(f"{seed}/{purpose}/{index}".encode()).digest()[:4]
         expected = (first[0] & 127) << 24 | first[1] << 16 | first[2] << 8 | first[3]
-        run.exact(f"derive_seed({seed}, {purpose}, {index})", run.call("derive_seed", seed, purpose, index), expected)
+        yield exact("derive_seed", (seed, purpose, index), expected, where=f"derive_seed({seed}, {purpose}, {index})")
+
+    purposes = st.sampled_from(["policy", "replay", "evaluation"])
+    yield Drawn(case, seed=st.integers(0, 2**40), purpose=purposes, index=st.integers(0, 2**40))
