@@ -129,8 +129,8 @@ def unit_directions(problem: Problem, seed: int) -> dict[str, dict[str, np.ndarr
     groups = {"all": ("",), "all, again": ("",), **GROUPS}
     directions = {}
     for label, prefixes in groups.items():
-        sign = -1 if label == "all, again" else 1
-        chosen = {name: value ** (3 if sign < 0 else 1) for name, value in noise.items() if name.startswith(prefixes)}
+        power = 3 if label == "all, again" else 1
+        chosen = {name: value**power for name, value in noise.items() if name.startswith(prefixes)}
         length = math.sqrt(sum(float((value**2).sum()) for value in chosen.values()))
         if length:
             directions[label] = {name: value / length for name, value in chosen.items()}
