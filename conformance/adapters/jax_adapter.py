@@ -48,7 +48,7 @@ class JaxAdapter:
                 return functools.partial(self._run, function, name, row not in EAGER_ROWS, first)
         raise AttributeError(name)
 
-    def prepare(self, calls: Iterable[tuple[str, tuple[Any, ...]]]) -> None:
+    def compile_calls(self, calls: Iterable[tuple[str, tuple[Any, ...]]]) -> None:
         """Compiles what these calls need, several at a time, and everything without the optimizations that take longer
         than small calls themselves. What a call raises is raised when it is made."""
         self.compiler_options = QUICK

@@ -1,5 +1,7 @@
 """Checks of spec/07-returns.md."""
 
+from typing import Any
+
 import hypothesis.strategies as st
 import numpy as np
 
@@ -66,9 +68,7 @@ def lambda_return_ignores_the_start(setting: Setting) -> Cases:
         def same(c: Comparisons, before: np.ndarray, after: np.ndarray, argument: int = argument) -> None:
             c.exact(f"NaN in argument {argument} at index 0", after, before)
 
-        yield related(
-            same, ("lambda_return", (*arrays, GAMMA, 0.95)), ("lambda_return", (*spoiled, GAMMA, 0.95))
-        )
+        yield related(same, ("lambda_return", (*arrays, GAMMA, 0.95)), ("lambda_return", (*spoiled, GAMMA, 0.95)))
 
 
 @check("RET-7", uses=["cumulative_weights"], level=0)
@@ -142,7 +142,7 @@ def replay_return_does_not_cross_ends(setting: Setting) -> Cases:
         for after in changed:
             c.exact("returns up to the end", np.asarray(after)[:, :4], np.asarray(before)[:, :4])
 
-    calls = [("replay_lambda_return", (*arrays, GAMMA, 0.95))]
+    calls: list[tuple[str, tuple[Any, ...]]] = [("replay_lambda_return", (*arrays, GAMMA, 0.95))]
     for place, value in ((0, 1e6), (3, -1e6), (1, True), (2, True)):
         other = [x.copy() for x in arrays]
         other[place][:, 0] = value
@@ -194,7 +194,7 @@ def return_range_literals(setting: Setting) -> Cases:
 @check("RET-14", uses=["update_return_range"], level=0)
 def return_range_matches(setting: Setting) -> Cases:
     """Percentiles over all returns of the batch together, decay and percentiles from the configuration."""
-    overrides = {"return_decay": 0.9, "return_percentile_low": 10.0, "return_percentile_high": 80.0}
+    overrides: dict[str, Any] = {"return_decay": 0.9, "return_percentile_low": 10.0, "return_percentile_high": 80.0}
     config = small_config(setting.profile, **overrides)
     returns = setting.cast(setting.rng().normal(size=(7, 3)) * 50)
     expected = reference.update_return_range(0.5, 2.0, returns, config)

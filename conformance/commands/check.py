@@ -129,9 +129,9 @@ def _fit(console: Console, checks: list[Check], adapter: object, options: argpar
 
 def _run_all(console: Console, checks: list[Check], adapter: object, asked: CheckOptions) -> Iterable[Result]:
     edition = editions()[asked.edition]
-    if prepare := getattr(adapter, "prepare", None):
+    if compile_calls := getattr(adapter, "compile_calls", None):
         with console.status("compiling"):
-            prepare(calls_of(checks, adapter, asked.setting))
+            compile_calls(calls_of(checks, adapter, asked.setting))
     with console.status("checking") as status:
         for number, check in enumerate(checks, 1):
             status.update(f"{number}/{len(checks)} {check.name}")
