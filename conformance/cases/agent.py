@@ -177,7 +177,7 @@ def gradient_is_right(setting: Setting, observation: str, action: str) -> Callab
     return relation
 
 
-@check("AGT-32", uses=["gradients", "loss_derivatives"], level=2, dtypes=WHOLE)
+@check("AGT-32", uses=["gradients"], level=2, dtypes=WHOLE)
 def total_gradient_is_the_weighted_sum(setting: Setting) -> Cases:
     """The gradient of the total is the weighted sum of the gradients of the losses, for every parameter."""
     for observation, action in (("vector", "discrete"), ("both", "mixed")):
