@@ -17,7 +17,8 @@ from conformance.case import Setting
 from conformance.cli import main
 from conformance.execute import run_check
 from conformance.offered import offered, unchecked
-from conformance.reports import badge, html, junit, markdown, summary, terminal, tex
+from conformance.pages import prose, tex
+from conformance.reports import badge, html, junit, markdown, summary, terminal
 from conformance.requirements import requirements
 
 
@@ -301,8 +302,7 @@ def test_formulas_are_plain_text() -> None:
     )
     assert tex.plain(text) == "`a$b$` is 16 δ (1 + |x|), p_(c+j) ≥ 10⁻¹², sg(x₀) and 1/2 √n"
     assert (
-        html.prose("**[X-1]** a `b*c*` *d* $e < 2 * f * g$")
-        == "<b>[X-1]</b> a <code>b*c*</code> <i>d</i> e &lt; 2 * f * g"
+        prose("**[X-1]** a `b*c*` *d* $e < 2 * f * g$") == "<b>[X-1]</b> a <code>b*c*</code> <i>d</i> e &lt; 2 * f * g"
     )
 
 

@@ -218,7 +218,7 @@ def test_a_report_tells_runs_apart_by_them(make: Make, tmp_path: Path) -> None:
         loop.run(make(task=TASK, env_arg={"size": size}, time_limit=5, logdir=tmp_path / f"{size}"), FakeLearner)
     page = render([read_run(tmp_path / name) for name in ("3", "4")], 0.0)
     for size in (3, 4):
-        assert f"<th>env_arg {{&#x27;size&#x27;: {size}}}" in page
+        assert f"<th>env_arg {{&#39;size&#39;: {size}}}" in page
 
 
 @pytest.mark.covers("LOOP-63")

@@ -313,13 +313,15 @@ def test_headlines(tmp_path: Path) -> None:
         return headline(group)
 
     evaluated = {"step": 9, "evaluation/return": 100.0, "evaluation/return_standard_error": 2.0}
-    assert groups([evaluated])[0] == "100 <small>± 2</small>"
-    value, lines = groups([evaluated], [{**evaluated, "evaluation/return": 300.0}])
-    assert value == "200 <small>± 100</small>", "the error over seeds, not over episodes"
-    assert lines[:2] == ["return, last evaluation, mean over 2 seeds", "± standard error over them"]
-    value, lines = groups([{"step": step, "episode/return": float(step)} for step in range(1, 31)])
-    assert (value, lines[0]) == ("20.5", "return, mean of the last 20 training episodes")
-    assert groups([{"step": 1, "episode/return": NAN}])[0] == "no return yet"
+    found = groups([evaluated])
+    assert (found.value, found.error) == ("100", "± 2")
+    found = groups([evaluated], [{**evaluated, "evaluation/return": 300.0}])
+    assert (found.value, found.error) == ("200", "± 100"), "the error over seeds, not over episodes"
+    assert found.lines[:2] == ["return, last evaluation, mean over 2 seeds", "± standard error over them"]
+    found = groups([{"step": step, "episode/return": float(step)} for step in range(1, 31)])
+    assert (found.value, found.lines[0]) == ("20.5", "return, mean of the last 20 training episodes")
+    assert (found := groups([{"step": 1, "episode/return": NAN}])).value == "no return yet"
+    assert found.error == ""
 
 
 def test_the_state_of_a_run(tmp_path: Path) -> None:

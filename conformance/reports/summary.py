@@ -245,6 +245,12 @@ def values(failure: Data) -> list[Data]:
     return [*failure["arguments"], *(failure[name] for name in ("got", "expected") if failure[name])]
 
 
+def chapters_of(data: Data, check: Data) -> list[str]:
+    """The paths of the chapters whose requirements a check covers."""
+    known = data["requirements"]
+    return sorted({known[name]["chapter"] for name in check["requirements"] if name in known})
+
+
 def matching(data: Data, check: str) -> list[Data]:
     """The diagnoses that explain a check."""
     return [diagnosis for diagnosis in data["diagnoses"] if check in diagnosis["explained"]]

@@ -1,13 +1,12 @@
 """The charts of one task: returns first, then every metric."""
 
-import re
+import dataclasses
 from collections.abc import Sequence
-from html import escape
 
 import numpy as np
+from markupsafe import Markup
 
 from dreamer_spec.report.catalogue import Metric, find, sections
-from dreamer_spec.report.html import breakable, details, swatch
 from dreamer_spec.report.results import number
 from dreamer_spec.report.runs import Curve, Group
 from dreamer_spec.report.series import Band, over_runs, over_values, stacked, thinned
@@ -17,109 +16,95 @@ SMOOTH, FINE = 50, 100  # stretches of a curve: for the noisy returns, and for o
 EPISODES_EACH = 5  # on average in a stretch at least
 OTHER = "other"
 MOST = 200  # metrics of a section that are drawn
-TIME_COLORS = {
-    "train": 0,
-    "environments": 1,
-    "policy": 2,
-    "replay": 4,
-    "evaluation": 3,
-    "checkpoint": 5,
-    "log": 7,
-    "other": 6,
-}
+TIME_COLORS = {"train": 0, "environments": 1, "policy": 2, "replay": 4, "evaluation": 3, "checkpoint": 5, "log": 7}
+TIME_OTHER = 6  # the colour of the rest
 
-EPISODE, EVALUATION, ERROR, RANDOM = (
-    "episode/return",
-    "evaluation/return",
-    "evaluation/return_standard_error",
-    "random/return",
-)
+EPISODE, EVALUATION, RANDOM = "episode/return", "evaluation/return", "random/return"
+ERROR = "evaluation/return_standard_error"
 ABOVE = (EPISODE, EVALUATION, ERROR, RANDOM)  # what the charts of returns show
 
 
-def task_section(task: str, groups: Sequence[Group], several: bool) -> str:
+@dataclasses.dataclass(frozen=True)
+class Figure:
+    """A chart with its caption. metric: whose meaning stands below."""
+
+    name: str
+    notes: list[str]
+    picture: Markup
+    metric: Metric | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Charts:
+    """Of a section of metrics. legend: colour and words. left_out: how many metrics are not drawn."""
+
+    title: str
+    about: str
+    figures: list[Figure]
+    legend: list[tuple[int, str]]
+    left_out: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Task:
+    """reference: what a random policy gets, "" if nobody has tried."""
+
+    name: str
+    groups: Sequence[Group]
+    returns: list[Figure]
+    reference: str
+    metrics: list[Charts]
+
+    @property
+    def legend(self) -> list[tuple[int, str]]:
+        return [(group.color, group.label) for group in self.groups]
+
+    @property
+    def several_seeds(self) -> bool:
+        return any(len(group.runs) > 1 for group in self.groups)
+
+
+def task_charts(name: str, groups: Sequence[Group]) -> Task:
     """The returns of a task's groups over environment steps, then every metric in its section."""
     curves = [curve for group in groups for run in group.runs for curve in run.curves.values()]
-    if not curves:
-        return f"<h2>{escape(task or 'unknown task')}</h2><p>Nothing has been logged yet.</p>"
-    end = max(float(curve.steps[-1]) for curve in curves)
-    legend = "".join(f"<span>{swatch(group.color)}{escape(group.label)}</span>" for group in groups)
-    title = f"Returns: {task or 'unknown task'}" if several else "Returns"
-    parts = [
-        f"<h2>{escape(title)}</h2>",
-        f'<div class="legend">{legend}</div>',
-        _returns(groups, end),
-        "<h2>Metrics</h2>",
-        _reading(groups),
-    ]
-    parts += [f'<div class="legend">{legend}</div>'] if len(groups) > 1 else []
-    return "".join(parts) + "".join(_metric_sections(groups, end))
-
-
-def _returns(groups: Sequence[Group], end: float) -> str:
-    """Training episodes and evaluations side by side, with the same vertical axis."""
-    random = [value for group in groups for run in group.runs if (value := run.last(RANDOM)) is not None]
+    end = max((float(curve.steps[-1]) for curve in curves), default=0.0)
+    random = [value for group in groups for value in group.last(RANDOM)]
     reference = float(np.mean(random)) if random else None
-    charts = [("Training episodes", _training(groups, end)), ("Evaluations", _evaluations(groups))]
-    charts = [(title, series) for title, series in charts if series]
-    if not charts:
-        return "<p>No episode has ended yet.</p>"
-    low, high = value_range([one for _, series in charts for one in series], reference)
+    shown = "" if reference is None else number(reference)
+    return Task(name, groups, _returns(groups, end, reference), shown, _sections(groups, end))
+
+
+def _returns(groups: Sequence[Group], end: float, reference: float | None) -> list[Figure]:
+    """Training episodes and evaluations side by side, with the same vertical axis."""
+    charts = {"Training episodes": _training(groups, end), "Evaluations": _evaluations(groups)}
+    low, high = value_range([one for series in charts.values() for one in series], reference)
     room = 0.04 * (high - low) or 1.0
     limits = (low if low == 0 else low - room, high + room)
     figures = []
-    for title, series in charts:
-        picture = line_chart(
-            series,
-            LARGE,
-            f"{title}: return over environment steps",
-            x_end=end,
-            x_label="environment steps",
-            reference=reference,
-            limits=limits,
-        )
-        figures.append(f'<figure><figcaption><span class="name">{title}</span> return</figcaption>{picture}</figure>')
-    seeds = any(len(group.runs) > 1 for group in groups)
-    words = [
-        "Dots are single training episodes"
-        + (", those of all seeds," if seeds else "")
-        + " and the line is their mean over stretches of steps."
-    ]
-    if seeds:
-        words.append(
-            "With several seeds, lines and dots are means over seeds, bands and whiskers go "
-            "from the lowest seed to the highest."
-        )
-    if any(len(group.runs) == 1 for group in groups) and len(charts) > 1:
-        words.append("The whiskers of a single run are the standard error over the episodes of an evaluation.")
-    if reference is not None:
-        words.append(f"Dashed: what a random policy gets, {number(reference)}.")
-    return f'<div class="large">{"".join(figures)}</div><p class="small muted">{" ".join(words)}</p>'
+    for title, series in charts.items():
+        label = f"{title}: return over environment steps"
+        picture = line_chart(series, LARGE, label, end, reference=reference, limits=limits)
+        figures += [Figure(title, ["return"], picture)] if series else []
+    return figures
 
 
 def _training(groups: Sequence[Group], end: float) -> list[Series]:
     found = []
     for group in groups:
-        curves = [run.curves[EPISODE] for run in group.runs if EPISODE in run.curves]
-        if curves:
+        if curves := group.curves(EPISODE):
             stretches = int(np.clip(min(len(curve.steps) for curve in curves) / EPISODES_EACH, 1, SMOOTH))
-            found.append(
-                Series(
-                    group.label, group.color, over_runs(curves, stretches, end), [thinned(curve) for curve in curves]
-                )
-            )
+            band = over_runs(curves, stretches, end)
+            found.append(Series(group.label, group.color, band, list(map(thinned, curves))))
     return found
 
 
 def _evaluations(groups: Sequence[Group]) -> list[Series]:
     found = []
     for group in groups:
-        runs = [run for run in group.runs if EVALUATION in run.curves]
-        if runs:
-            error = runs[0].curves.get(ERROR) if len(runs) == 1 else None
-            found.append(
-                Series(group.label, group.color, _at_steps([run.curves[EVALUATION] for run in runs], error), dots=True)
-            )
+        if curves := group.curves(EVALUATION):
+            errors = group.curves(ERROR)
+            band = _at_steps(curves, errors[0] if errors and len(curves) == 1 else None)
+            found.append(Series(group.label, group.color, band, dots=True))
     return found
 
 
@@ -140,18 +125,7 @@ def _at_steps(curves: Sequence[Curve], error: Curve | None) -> Band:
     return Band(at, middle, low, high, steps[~finite])
 
 
-def _reading(groups: Sequence[Group]) -> str:
-    means = "the mean over seeds" if any(len(group.runs) > 1 for group in groups) else "the mean"
-    return (
-        f'<p class="small muted">Over environment steps. Lines are {means} over stretches of '
-        f"steps; bands go from the lowest to the "
-        "highest value that was logged there. A red cross marks a value that is not finite. "
-        "Positive values that spread far have a "
-        "logarithmic axis.</p>"
-    )
-
-
-def _metric_sections(groups: Sequence[Group], end: float) -> list[str]:
+def _sections(groups: Sequence[Group], end: float) -> list[Charts]:
     """Every metric that some run has, in the order of the catalogue; what nobody has described comes last."""
     names = dict.fromkeys(name for group in groups for run in group.runs for name in run.curves if name not in ABOVE)
     order = [metric.name for section in sections().values() for metric in section.metrics]
@@ -160,84 +134,46 @@ def _metric_sections(groups: Sequence[Group], end: float) -> list[str]:
     found = {name: find(name) for name in names}
     for name, entry in sorted(found.items(), key=lambda item: rank[item[1][1].name] if item[1] else len(rank)):
         chosen[entry[0] if entry else OTHER].append(name)
-    parts = []
-    for section, members in chosen.items():
-        if not members:
-            continue
-        left_out, members = len(members) - MOST, members[:MOST]
-        content = _time_split(groups, members, end) if section == "time" else _tiles(groups, members, end)
-        title = sections()[section].title if section in sections() else "Other metrics"
-        about = f'<p class="small muted">{_prose(sections()[section].about)}</p>' if section in sections() else ""
-        more = f"<p>{left_out:,} more metrics of this section are not drawn.</p>" if left_out > 0 else ""
-        parts.append(f"<h3>{escape(title)}</h3>{about}{content}{more}")
-    return parts
+    return [_section(groups, section, members, end) for section, members in chosen.items() if members]
 
 
-def _tiles(groups: Sequence[Group], names: Sequence[str], end: float) -> str:
-    return f'<div class="tiles">{"".join(_tile(groups, name, end) for name in names)}</div>'
+def _section(groups: Sequence[Group], section: str, names: Sequence[str], end: float) -> Charts:
+    known = sections().get(section)
+    title, about = (known.title, known.about) if known else ("Other metrics", "")
+    drawn, left_out = names[:MOST], max(0, len(names) - MOST)
+    if section == "time":
+        return Charts(title, about, *_time_split(groups, drawn, end), left_out)
+    return Charts(title, about, [_tile(groups, name, end) for name in drawn], [], left_out)
 
 
-def _tile(groups: Sequence[Group], name: str, end: float) -> str:
+def _tile(groups: Sequence[Group], name: str, end: float) -> Figure:
     """One metric: a small chart, its unit, its last value if there is only one, and what it means."""
     series, last = [], []
     for group in groups:
-        curves = [run.curves[name] for run in group.runs if name in run.curves]
-        if curves:
+        if curves := group.curves(name):
             series.append(Series(group.label, group.color, over_values(curves, FINE, end)))
-            last += [value for run in group.runs if (value := run.last(name)) is not None]
-    entry = find(name)
-    unit = f"<span>{escape(entry[1].unit)}</span>" if entry and entry[1].unit else ""
-    now = f"<span>last {number(last[0])}</span>" if len(last) == 1 else ""
-    caption = f'<figcaption><span class="name">{breakable(name.removeprefix("train/"))}</span>{unit}{now}</figcaption>'
-    meaning = _meaning(entry[1]) if entry else ""
-    return (
-        f"<figure>{caption}{line_chart(series, SMALL, f'{name} over environment steps', x_end=end)}{meaning}</figure>"
-    )
+            last += group.last(name)
+    _, metric = find(name) or (OTHER, None)
+    notes = [metric.unit] if metric and metric.unit else []
+    notes += [f"last {number(last[0])}"] if len(last) == 1 else []
+    picture = line_chart(series, SMALL, f"{name} over environment steps", end)
+    return Figure(name.removeprefix("train/"), notes, picture, metric)
 
 
-def _meaning(metric: Metric) -> str:
-    lines = [
-        _prose(metric.what),
-        f"<b>Healthy.</b> {_prose(metric.healthy)}",
-        f"<b>Trouble.</b> {_prose(metric.trouble)}",
-    ]
-    return details("what it means", "".join(f"<p>{line}</p>" for line in lines))
-
-
-def _prose(text: str) -> str:
-    """Text of the catalogue as markup: `code` is kept, links are dropped."""
-    plain = re.sub(r"\[([^\]]+)\]\([^)]*\)", r"\1", text)
-    return re.sub(r"`([^`]+)`", r"<code>\1</code>", escape(plain))
-
-
-def _time_split(groups: Sequence[Group], names: Sequence[str], end: float) -> str:
-    """One stacked chart for each group."""
+def _time_split(
+    groups: Sequence[Group], names: Sequence[str], end: float
+) -> tuple[list[Figure], list[tuple[int, str]]]:
+    """One stacked chart for each group, and the legend of all."""
     figures = []
     shown: dict[str, float] = {}
     for group in groups:
-        curves = {
-            name.removeprefix("time/"): found
-            for name in names
-            if (found := [run.curves[name] for run in group.runs if name in run.curves])
-        }
-        ordered = {name: curves[name] for name in [*TIME_COLORS, *curves] if name in curves}
+        curves = {name.removeprefix("time/"): found for name in names if (found := group.curves(name))}
+        ordered = {name: curves[name] for name in [*TIME_COLORS, "other", *curves] if name in curves}
         steps, shares = stacked(ordered, FINE, end)
         if len(steps):
             shown |= {name: float(np.mean(share)) for name, share in shares.items()}
-            picture = stacked_chart(
-                steps,
-                shares,
-                {name: TIME_COLORS.get(name, 6) for name in shares},
-                LARGE,
-                f"time split of {group.label}",
-                end,
-            )
-            figures.append(
-                f'<figure><figcaption><span class="name">{escape(group.label)}</span> share of wall '
-                f"time</figcaption>{picture}</figure>"
-            )
-    shares_of = "".join(
-        f"<span>{swatch(TIME_COLORS.get(name, 6))}{escape(name)}{f' {share:.0%}' if len(figures) == 1 else ''}</span>"
-        for name, share in shown.items()
-    )
-    return f'<div class="legend">{shares_of}</div><div class="large">{"".join(figures)}</div>'
+            colors = {name: TIME_COLORS.get(name, TIME_OTHER) for name in shares}
+            picture = stacked_chart(steps, shares, colors, f"time split of {group.label}", end)
+            figures.append(Figure(group.label, ["share of wall time"], picture))
+    words = {name: f"{name} {share:.0%}" if len(figures) == 1 else name for name, share in shown.items()}
+    return figures, [(TIME_COLORS.get(name, TIME_OTHER), text) for name, text in words.items()]

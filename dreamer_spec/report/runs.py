@@ -98,6 +98,14 @@ class Group:
         what = "seed" if len(seeds) == count and None not in seeds else "run"
         return f"{count} {what}{'' if count == 1 else 's'}"
 
+    def curves(self, name: str) -> list[Curve]:
+        """Of the runs that have this metric."""
+        return [run.curves[name] for run in self.runs if name in run.curves]
+
+    def last(self, name: str) -> list[float]:
+        """The newest finite values of a metric, of the runs that have one."""
+        return [value for run in self.runs if (value := run.last(name)) is not None]
+
 
 def find_logdirs(paths: Sequence[Path], say: Callable[[str], None] = print) -> list[Path]:
     """The log directories among these paths and, where a path is none, directly below it; each once.

@@ -1,13 +1,15 @@
-"""Charts as SVG. Colours are classes (c0, c1, ...), so that the page's style decides about light and dark."""
+"""Charts as SVG, drawn by templates/chart.svg. Colours are classes (c0, c1, ...), so that the page's style decides
+about light and dark."""
 
 import dataclasses
 import itertools
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from html import escape
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
+from markupsafe import Markup
 
+from conformance import pages
 from dreamer_spec.report.runs import Curve
 from dreamer_spec.report.series import Band
 
@@ -15,6 +17,8 @@ COLORS = 8
 LOG_RANGE = 50.0  # positive values that spread over more than this factor have a logarithmic axis
 LARGEST_NUMBER, SMALLEST_ROOM = 1e300, 1e-30  # what an axis shows: arithmetic with its ends must not overflow or vanish
 MOST_MARKS = 40  # crosses for values that are not finite
+
+Show = Callable[[float], str]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,8 +44,25 @@ class Frame:
     top: int = 10
     bottom: int = 24
 
+    @property
+    def is_large(self) -> bool:
+        """Whether there is room for many numbers, and for words at the axis of steps."""
+        return self.height > 200
+
 
 LARGE, SMALL = Frame(420, 250, bottom=38), Frame(300, 150)
+
+
+@dataclasses.dataclass(frozen=True)
+class Shape:
+    """A path. kind: its classes. label: of a line, for the page's script. moved: by how much it stands beside its
+    steps."""
+
+    kind: str
+    path: str
+    title: str = ""
+    label: str | None = None
+    moved: float = 0.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,12 +92,10 @@ def line_chart(
     series: Sequence[Series],
     frame: Frame,
     label: str,
-    *,
     x_end: float,
-    x_label: str = "",
     reference: float | None = None,
     limits: tuple[float, float] | None = None,
-) -> str:
+) -> Markup:
     """Lines with their bands over environment steps.
 
     label: for those who cannot see it. x_end: where the axis of steps ends. reference: where a dashed horizontal line
@@ -85,121 +104,94 @@ def line_chart(
     low, high = limits or value_range(series, reference)
     log = limits is None and SMALLEST_ROOM < low < high / LOG_RANGE and high < LARGEST_NUMBER
     y = vertical_axis(low, high, frame, log)
-    x = Axis(0.0, max(x_end, 1.0), frame.left, frame.width - frame.right)
-    parts = [grid(x, y, frame, x_label)]
-    if reference is not None:
-        parts.append(
-            f'<path class="reference" d="M{frame.left},{float(y(reference)):.1f}H{frame.width - frame.right}"/>'
-        )
-    parts += [_points(curve, one.color, x, y) for one in series for curve in one.points]
-    parts += [_band(one, x, y) for one in series if not one.dots]
+    x = steps_axis(x_end, frame)
+    shapes = [] if reference is None else [Shape("reference", f"M{x.start},{float(y(reference)):.1f}H{x.stop}")]
+    shapes += [_points(curve, one.color, x, y) for one in series for curve in one.points]
+    shapes += [shape for one in series if not one.dots for shape in _band(one, x, y)]
     for index, one in enumerate(series):
         by = 4.0 * (index - (len(series) - 1) / 2) if one.dots else 0.0  # so that whiskers do not hide each other
-        parts += [_whiskers(one, x.moved(by), y) if one.dots else "", _line(one, x.moved(by), y, by)]
+        shapes += _line(one, x.moved(by), y, by)
     bad = np.unique(np.concatenate([one.band.bad for one in series])) if series else np.empty(0)
-    parts += [_bad(step, x, frame) for step in bad[np.linspace(0, len(bad) - 1, min(len(bad), MOST_MARKS)).astype(int)]]
-    return svg(frame, label, parts, x, y)
+    shapes += [_bad(at, x, frame) for at in bad[np.linspace(0, len(bad) - 1, min(len(bad), MOST_MARKS)).astype(int)]]
+    # With its axes, the page's script can tell values from positions.
+    numbers = [x.high, x.start, x.stop, y.low, y.high, y.start, y.stop, int(y.log)]
+    axes = " ".join(f"{number:.9g}" for number in numbers)
+    return _drawn(shapes, frame, label, x, y, axes=axes)
 
 
 def stacked_chart(
-    steps: np.ndarray,
-    shares: Mapping[str, np.ndarray],
-    colors: Mapping[str, int],
-    frame: Frame,
-    label: str,
-    x_end: float,
-) -> str:
+    steps: np.ndarray, shares: Mapping[str, np.ndarray], colors: Mapping[str, int], label: str, x_end: float
+) -> Markup:
     """Shares [n] of a whole over environment steps, one upon the other."""
-    x = Axis(0.0, max(x_end, 1.0), frame.left, frame.width - frame.right)
-    y = Axis(0.0, 1.0, frame.height - frame.bottom, frame.top)
-    parts = []
+    x, y = steps_axis(x_end, LARGE), Axis(0.0, 1.0, LARGE.height - LARGE.bottom, LARGE.top)
+    shapes = []
     below = np.zeros(len(steps))
     for name, share in shares.items():
         above = below + share
-        outline = path(np.concatenate([x(steps), x(steps)[::-1]]), np.concatenate([y(above), y(below)[::-1]])) + "Z"
-        title = f"<title>{escape(name)}: {np.mean(share):.1%} on average</title>"
-        parts.append(f'<path class="area c{colors[name] % COLORS}" d="{outline}">{title}</path>')
+        title = f"{name}: {np.mean(share):.1%} on average"
+        shapes.append(Shape(f"area {_color(colors[name])}", outline(x(steps), y(above), y(below)), title))
         below = above
-    parts.insert(0, grid(x, y, frame, "", show=lambda value: f"{value:.0%}"))
-    return svg(frame, label, parts, None, None)
+    return _drawn(shapes, LARGE, label, x, y, show="{:.0%}".format)
 
 
-def svg(frame: Frame, label: str, parts: Iterable[str], x: Axis | None, y: Axis | None) -> str:
-    """The picture. With its axes, the page's script can tell values from positions."""
-    data = ""
-    if x and y:
-        numbers = [x.high, x.start, x.stop, y.low, y.high, y.start, y.stop, int(y.log)]
-        data = f' data-axes="{" ".join(f"{number:.9g}" for number in numbers)}"'
-    size = f'viewBox="0 0 {frame.width} {frame.height}"'
-    return f'<svg role="img" aria-label="{escape(label)}" {size}{data}>{"".join(parts)}</svg>'
+def _drawn(
+    shapes: Sequence[Shape], frame: Frame, label: str, x: Axis, y: Axis, show: Show | None = None, axes: str = ""
+) -> Markup:
+    """The picture: a grid with the numbers at both axes, and the shapes upon it."""
+    count = 5 if frame.is_large else 3
+    heights, steps = y.ticks(count), x.ticks(count)
+    show, show_step = show or tick_format(heights, y.log), tick_format(steps, False)
+    values = {
+        "heights": [(float(y(value)), show(value)) for value in heights],
+        "steps": [(float(x(value)), show_step(value)) for value in steps],
+    }
+    return Markup(pages.render(__package__, "chart.svg", frame=frame, label=label, axes=axes, shapes=shapes, **values))
 
 
-def grid(x: Axis, y: Axis, frame: Frame, x_label: str, show: Callable[[float], str] | None = None) -> str:
-    """Horizontal lines, and the numbers at both axes."""
-    parts = []
-    ticks = y.ticks(5 if frame.height > 200 else 3)
-    show = show or tick_format(ticks, y.log)
-    for value in ticks:
-        at = float(y(value))
-        parts.append(f'<path class="grid" d="M{frame.left},{at:.1f}H{frame.width - frame.right}"/>')
-        parts.append(f'<text x="{frame.left - 5}" y="{at + 3.5:.1f}" text-anchor="end">{show(value)}</text>')
-    base = frame.height - frame.bottom
-    parts.append(f'<path class="axis" d="M{frame.left},{base}H{frame.width - frame.right}"/>')
-    ticks = x.ticks(5 if frame.width > 400 else 3)
-    show_steps = tick_format(ticks, False)
-    for value in ticks:
-        at = float(x(value))
-        anchor = "end" if at > frame.width - 24 else "middle"
-        parts.append(f'<path class="axis" d="M{at:.1f},{base}v3"/>')
-        parts.append(
-            f'<text x="{min(at, frame.width - 1):.1f}" y="{base + 14}" '
-            f'text-anchor="{anchor}">{show_steps(value)}</text>'
-        )
-    if x_label:
-        middle = (frame.left + frame.width - frame.right) / 2
-        parts.append(f'<text x="{middle:.0f}" y="{frame.height - 6}" text-anchor="middle">{escape(x_label)}</text>')
-    return "".join(parts)
+def _color(color: int) -> str:
+    return f"c{color % COLORS}"
 
 
-def _points(curve: Curve, color: int, x: Axis, y: Axis) -> str:
+def _points(curve: Curve, color: int, x: Axis, y: Axis) -> Shape:
     positions = zip(x(curve.steps), y(curve.values), strict=True)
-    dots = "".join(f"M{across:.0f},{up:.1f}h0" for across, up in positions)
-    return f'<path class="points c{color % COLORS}" d="{dots}"/>' if dots else ""
+    return Shape(f"points {_color(color)}", "".join(f"M{across:.0f},{up:.1f}h0" for across, up in positions))
 
 
-def _band(series: Series, x: Axis, y: Axis) -> str:
+def _band(series: Series, x: Axis, y: Axis) -> list[Shape]:
     band = series.band
     if len(band) < 2 or np.array_equal(band.low, band.high):
-        return ""
-    across = x(band.steps)
-    outline = path(np.concatenate([across, across[::-1]]), np.concatenate([y(band.high), y(band.low)[::-1]]))
-    return f'<path class="band c{series.color % COLORS}" d="{outline}Z"/>'
+        return []
+    return [Shape(f"band {_color(series.color)}", outline(x(band.steps), y(band.high), y(band.low)))]
 
 
-def _whiskers(series: Series, x: Axis, y: Axis) -> str:
-    band = series.band
-    ends = zip(x(band.steps), y(band.low), y(band.high), strict=True)
-    lines = "".join(f"M{across:.1f},{low:.1f}V{high:.1f}" for across, low, high in ends if low != high)
-    return f'<path class="whisker c{series.color % COLORS}" d="{lines}"/>' if lines else ""
-
-
-def _line(series: Series, x: Axis, y: Axis, moved: float) -> str:
-    if not len(series.band):
-        return ""
-    across, up = x(series.band.steps), y(series.band.middle)
-    color = f"c{series.color % COLORS}" + (" dashed" if series.color >= COLORS else "")
-    parts = [
-        f'<path class="line {color}" data-label="{escape(series.label)}" '
-        f'data-moved="{moved:g}" d="{path(across, up)}"/>'
-    ]
+def _line(series: Series, x: Axis, y: Axis, moved: float) -> list[Shape]:
+    """The line of a series, with whiskers below it and dots upon it where it is one of dots."""
+    band, color = series.band, _color(series.color)
+    if not len(band):
+        return []
+    across, up = x(band.steps), y(band.middle)
+    dashed = " dashed" if series.color >= COLORS else ""
+    shapes = [Shape(f"line {color}{dashed}", path(across, up), label=series.label, moved=moved)]
+    if series.dots:
+        ends = zip(across, y(band.low), y(band.high), strict=True)
+        whiskers = "".join(f"M{at:.1f},{low:.1f}V{high:.1f}" for at, low, high in ends if low != high)
+        shapes.insert(0, Shape(f"whisker {color}", whiskers))
     if series.dots or len(across) == 1:
-        parts += [f'<circle class="{color}" cx="{a:.1f}" cy="{b:.1f}" r="3"/>' for a, b in zip(across, up, strict=True)]
-    return "".join(parts)
+        dots = (
+            f"M{at - 3:.1f},{height:.1f}a3,3,0,1,0,6,0a3,3,0,1,0-6,0" for at, height in zip(across, up, strict=True)
+        )
+        shapes.append(Shape(f"dot {color}", "".join(dots)))
+    return shapes
 
 
-def _bad(step: float, x: Axis, frame: Frame) -> str:
-    title = f"<title>not finite at step {step:,.0f}</title>"
-    return f'<path class="bad" d="M{float(x(step)) - 3:.1f},{frame.top - 6}l6,6m0,-6l-6,6">{title}</path>'
+def _bad(step: float, x: Axis, frame: Frame) -> Shape:
+    cross = f"M{float(x(step)) - 3:.1f},{frame.top - 6}l6,6m0,-6l-6,6"
+    return Shape("bad", cross, f"not finite at step {step:,.0f}")
+
+
+def outline(across: np.ndarray, up: np.ndarray, down: np.ndarray) -> str:
+    """What lies between two lines."""
+    return path(np.concatenate([across, across[::-1]]), np.concatenate([up, down[::-1]])) + "Z"
 
 
 def path(across: np.ndarray, up: np.ndarray) -> str:
@@ -228,6 +220,10 @@ def vertical_axis(low: float, high: float, frame: Frame, log: bool) -> Axis:
     return Axis(low if low == 0 else low - room, high + room, start, stop)
 
 
+def steps_axis(end: float, frame: Frame) -> Axis:
+    return Axis(0.0, max(end, 1.0), frame.left, frame.width - frame.right)
+
+
 def linear_ticks(low: float, high: float, count: int) -> list[float]:
     """About so many round numbers from low to high."""
     raw = (high - low) / count
@@ -244,7 +240,7 @@ def log_ticks(low: float, high: float, count: int) -> list[float]:
     return [10.0**power for power in range(first, last + 1, every)]
 
 
-def tick_format(ticks: Sequence[float], log: bool) -> Callable[[float], str]:
+def tick_format(ticks: Sequence[float], log: bool) -> Show:
     """One way to write all numbers of an axis: 2,000, 40k, 1.5M, 0.25, 3e-05."""
     largest = max((abs(value) for value in ticks), default=0.0)
     step = min((b - a for a, b in itertools.pairwise(ticks)), default=1.0)

@@ -2,33 +2,9 @@
 
 import re
 
-SYMBOLS = {
-    **{
-        "alpha": "α",
-        "gamma": "γ",
-        "delta": "δ",
-        "epsilon": "ε",
-        "mu": "μ",
-        "pi": "π",
-        "rho": "ρ",
-        "sigma": "σ",
-        "upsilon": "υ",
-        "ell": "ℓ",
-    },
-    **{
-        "infty": "∞",
-        "cdot": "·",
-        "times": "×",
-        "le": "≤",
-        "ge": "≥",
-        "lt": "<",
-        "gt": ">",
-        "approx": "≈",
-        "in": "∈",
-        "to": "→",
-    },
-    **{"sum": "Σ", "ldots": "…", "dots": "…", "bmod": "mod"},
-}
+_GREEK = "alpha gamma delta epsilon mu pi rho sigma upsilon ell"
+_SIGNS = "infty cdot times le ge lt gt approx in to sum ldots dots"
+SYMBOLS = dict(zip(_GREEK.split() + _SIGNS.split(), "αγδεμπρσυℓ∞·×≤≥<>≈∈→Σ……", strict=True)) | {"bmod": "mod"}
 """Commands by what stands for them. Any other is its own name: max, ln, tanh."""
 ACCENTS = {"tilde": "\N{COMBINING TILDE}", "hat": "\N{COMBINING CIRCUMFLEX ACCENT}"}
 OPENING = {"lvert": "|", "lfloor": "⌊", "langle": "⟨", "pm": "±"}
