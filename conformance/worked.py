@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from conformance.adapter import INTERFACE, OBJECTS, RESULTS, load_adapter
+from conformance.adapter import INTERFACE, RESULTS, load_adapter
 from conformance.problems import small_config
 from spec import Spaces, Vector, parameter_table
 from spec.worked import Call, Case, Example, examples
@@ -64,7 +64,7 @@ def worked(row: str, *names: str, profile: str = "paper", dtype: str = "float64"
 
 def _cases(example: Example, profile: str, dtype: str) -> list[Worked]:
     name = f"{example.row}: {example.name}"
-    if example.function in OBJECTS:
+    if example.calls:
         return [_object(example, name)]
     numbered = [name] if len(example.cases) == 1 else [f"{name}, {n}" for n, _ in enumerate(example.cases, 1)]
     found = []
@@ -107,18 +107,23 @@ def _in_order(function: str, given: Mapping[str, Any], profile: str, dtype: str)
     }
     if "config" in INTERFACE[function]:
         arguments["config"] = small_config(profile, dtype, **arguments.get("config", {}))
-    if "others" in arguments.get("params", {}):
-        arguments["params"] = _all_parameters(arguments)
+    for group in ("params", "slow_critic"):
+        if "others" in arguments.get(group, {}):
+            arguments[group] = _all_parameters(arguments, group)
     return tuple(arguments[name] for name in INTERFACE[function])
 
 
-def _all_parameters(arguments: Mapping[str, Any]) -> dict[str, np.ndarray]:
+def _all_parameters(arguments: Mapping[str, Any], group: str) -> dict[str, np.ndarray]:
     """Every parameter of the table, with one number wherever the example names none."""
-    named = dict(arguments["params"])
+    named = dict(arguments[group])
     others = named.pop("others")
     task = arguments.get("spaces") or Spaces({"x": Vector(1)}, {"a": Vector(np.shape(arguments["action"])[-1])})
     table = parameter_table(arguments["config"], task)
-    return {name: named.get(name, np.full(entry.shape, float(others))) for name, entry in table.items()}
+    return {
+        name: named.get(name, np.full(entry.shape, float(others)))
+        for name, entry in table.items()
+        if group == "params" or name.startswith("critic/")
+    }
 
 
 def _whole(function: str, case: Case, reference: Any) -> tuple[Any, Any]:

@@ -58,7 +58,7 @@ def markdown(argument: str) -> str:
     known = examples(row)
     if unknown := set(names) - set(known):
         raise ValueError(f"{row} has no example named {', '.join(sorted(unknown))}; known: {', '.join(known)}")
-    return "\n" + "\n\n".join(paragraph(known[name]) for name in names or known) + "\n\n"
+    return "\n\n".join(paragraph(known[name]) for name in names or known) + "\n"
 
 
 def paragraph(example: Example) -> str:
@@ -77,10 +77,10 @@ def paragraph(example: Example) -> str:
 
 def _values(example: Example) -> dict[str, Printed]:
     """The names of a text: what the cases share, and lists of that in which they differ."""
-    cases = [case.written for case in example.cases]
+    cases = [{**example.written, **case.written} for case in example.cases]
     if len(cases) == 1:
         return {name: Printed(value) for name, value in cases[0].items()}
     names = dict.fromkeys(name for case in cases for name in case)
     lists = {name: [case.get(name) for case in cases] for name in names}
-    shared = {name for name in example.arguments if all(value == lists[name][0] for value in lists[name])}
+    shared = {name for name in example.written if all(value == lists[name][0] for value in lists[name])}
     return {name: Printed(values[0] if name in shared else values) for name, values in lists.items()}

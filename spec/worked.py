@@ -12,8 +12,9 @@ A file is a list of examples, each a call of one function with numbers that a re
   text = "The return of state 0 is {gives[0][0]}."
 
 `precision` says how near a result must be: "exact", in every bit; "printed", half a unit of the last digit that is
-written (whole numbers and formulas: 1e-12 of the number); or a number, relative. Several calls share a table: `cases`
-lists what each changes, its `gives` included. `calls` lists calls of one object in their order, each by its `method`.
+written (whole numbers and formulas: 1e-12 of the number); a number, relative; or a table of these, for the parts of a
+result. Several calls share a table: `cases` lists what each changes, its `gives` included. `calls` lists calls of one
+object in their order, each by its `method`, arguments in their order.
 
 An array is written as a list, or as a table with its `shape`: all `values` in row-major order, or one row that is
 repeated, or `others`, the number that fills it, and single entries, `127 = 0.5` or `"1, 1" = 1`. Arrays hold float64
@@ -76,7 +77,11 @@ class Case:
 
 @dataclasses.dataclass(frozen=True)
 class Example:
-    """One entry of a file. calls: whether the cases are calls of one object, made with `arguments`, in their order."""
+    """One entry of a file.
+
+    arguments: what the cases share; written: the same as the file has it. calls: whether the cases are calls of one
+    object, which is made with `arguments`, in their order.
+    """
 
     row: str
     name: str
@@ -84,8 +89,9 @@ class Example:
     function: str
     text: str
     arguments: Mapping[str, Any]
+    written: Mapping[str, Any]
     cases: tuple[Case, ...]
-    calls: bool = False
+    calls: bool
 
 
 @functools.cache
@@ -117,7 +123,9 @@ def _example(row: str, name: str, entry: dict[str, Any]) -> Example:
         raise ValueError(f"spec/examples/{row}.toml: {name!r}: {error}") from error
     requirements = tuple(about.pop("requirements"))
     given = {key: _argument(key, value) for key, value in arguments.items()}
-    return Example(row, name, requirements, arguments=given, cases=tuple(cases), calls=bool(calls), **about)
+    return Example(
+        row, name, requirements, arguments=given, written=arguments, cases=tuple(cases), calls=bool(calls), **about
+    )
 
 
 def _case(common: Mapping[str, Any], case: Mapping[str, Any], precision: Any) -> Case:
@@ -152,7 +160,8 @@ def _argument(name: str, written: Any) -> Any:
 def _result(written: Any, precision: Any) -> tuple[Any, Any]:
     """What is expected, and how far a result may lie from it."""
     if isinstance(written, dict) and not _is_array(written):
-        parts = {key: _result(value, precision) for key, value in written.items()}
+        finer = precision if isinstance(precision, dict) else dict.fromkeys(written, precision)
+        parts = {key: _result(value, finer[key]) for key, value in written.items()}
         return {key: part[0] for key, part in parts.items()}, {key: part[1] for key, part in parts.items()}
     if not isinstance(written, list | dict):
         return number(written), allowed(written, precision)

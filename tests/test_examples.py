@@ -11,8 +11,7 @@ from conformance.check import Run
 from conformance.requirements import chapter_of, requirements
 from conformance.worked import Worked, worked
 from docs import examples as pages
-from spec import profiles
-from spec.worked import ROWS, examples, number
+from spec.worked import ROWS, examples
 
 ROOT = Path(__file__).resolve().parent.parent
 CASES = [case for row in ROWS for case in worked(row)]
