@@ -1,14 +1,23 @@
-"""The worked numbers of the chapters as calls for checks, tests and pages.
+"""The worked numbers of the chapters (spec/examples) as calls, for checks and tests.
 
-In a check:
+In a check, with the rounding that the function may have beyond the example's own precision:
 
-  for case in worked("returns", "a return by hand", profile=run.profile):
+  for case in worked("returns", "a return by hand", "weights by hand", profile=run.profile):
       actual = run.call(case.function, *case.arguments)
       run.compare(case.name, actual, case.expected, magnitude=case.allowed(16 * run.u), bound=1.0)
 
 The names are those of spec/examples/returns.toml; without any, all of the row come, in its order. An example that
-lists several cases comes as several. Arguments are float64 arrays, in the order of the interface, not rounded to the
-dtype of a run.
+lists several cases comes as several. One of an object has `calls` instead of an expected result:
+
+  for case in worked("training_loop", "no drift"):
+      made = run.call(case.function, *case.arguments)
+      for call in case.calls:
+          actual = (getattr(made, call.function) if call.function else made)(*call.arguments)
+          if call.expected is not None:
+              run.compare(call.name, actual, call.expected, magnitude=call.allowed(), bound=1.0)
+
+Arguments are in the order of the interface: NumPy arrays of float64, booleans, or the dtype that the file names, not
+rounded to the dtype of a run; mappings of these; Spaces and Config.
 """
 
 import copy
@@ -67,12 +76,19 @@ def _cases(example: Example, profile: str, dtype: str) -> list[Worked]:
     if example.calls:
         return [_object(example, name)]
     numbered = [name] if len(example.cases) == 1 else [f"{name}, {n}" for n, _ in enumerate(example.cases, 1)]
-    found = []
-    for title, case in zip(numbered, example.cases, strict=True):
-        arguments = _in_order(example.function, case.arguments, profile, dtype)
-        reference = _call(example.function, arguments)
-        found.append(Worked(title, example.function, arguments, *_whole(example.function, case, reference)))
-    return found
+    return [
+        _case(title, example.function, case, profile, dtype)
+        for title, case in zip(numbered, example.cases, strict=True)
+    ]
+
+
+def _case(name: str, function: str, case: Case, profile: str, dtype: str) -> Worked:
+    try:
+        arguments = _in_order(function, case.arguments, profile, dtype)
+        reference = getattr(_reference(), function)(*copy.deepcopy(arguments))
+        return Worked(name, function, arguments, *_whole(function, case, reference))
+    except (KeyError, ValueError) as error:
+        raise ValueError(f"{name}: {error}") from error
 
 
 def _object(example: Example, name: str) -> Worked:
@@ -81,7 +97,7 @@ def _object(example: Example, name: str) -> Worked:
     made = getattr(_reference(), example.function)(*arguments)
     calls = []
     for n, case in enumerate(example.cases, 1):
-        given = tuple(case.arguments.values())
+        given = copy.deepcopy(tuple(case.arguments.values()))
         result = (getattr(made, case.method) if case.method else made)(*copy.deepcopy(given))
         expected, bound = (None, None) if case.expected is None else _whole(case.method, case, result)
         calls.append(Worked(f"{name}, {n}", case.method, given, expected, bound))
@@ -93,18 +109,13 @@ def _reference() -> Any:
     return load_adapter("numpy")
 
 
-def _call(function: str, arguments: tuple[Any, ...]) -> Any:
-    return getattr(_reference(), function)(*copy.deepcopy(arguments))
-
-
 def _in_order(function: str, given: Mapping[str, Any], profile: str, dtype: str) -> tuple[Any, ...]:
     """The arguments by position, configuration and parameters made, those that another function gives computed."""
-    arguments = {
-        name: _call(value.function, _in_order(value.function, value.arguments, profile, dtype))
-        if isinstance(value, Call)
-        else value
-        for name, value in given.items()
-    }
+    arguments = {name: copy.deepcopy(value) for name, value in given.items()}
+    for name, value in given.items():
+        if isinstance(value, Call):
+            inner = _in_order(value.function, value.arguments, profile, dtype)
+            arguments[name] = getattr(_reference(), value.function)(*inner)
     if "config" in INTERFACE[function]:
         arguments["config"] = small_config(profile, dtype, **arguments.get("config", {}))
     for group in ("params", "slow_critic"):

@@ -13,8 +13,8 @@ A file is a list of examples, each a call of one function with numbers that a re
 
 `precision` says how near a result must be: "exact", in every bit; "printed", half a unit of the last digit that is
 written (whole numbers and formulas: 1e-12 of the number); a number, relative; or a table of these, for the parts of a
-result. Several calls share a table: `cases` lists what each changes, its `gives` included. `calls` lists calls of one
-object in their order, each by its `method`, arguments in their order.
+result. Several calls share a table: `cases` lists what each adds or has otherwise, its `gives` included. `calls` lists
+calls of one object in their order, each by its `method`, with its arguments in their order.
 
 An array is written as a list, or as a table with its `shape`: all `values` in row-major order, or one row that is
 repeated, or `others`, the number that fills it, and single entries, `127 = 0.5` or `"1, 1" = 1`. Arrays hold float64
@@ -129,7 +129,7 @@ def _example(row: str, name: str, entry: dict[str, Any]) -> Example:
 
 
 def _case(common: Mapping[str, Any], case: Mapping[str, Any], precision: Any) -> Case:
-    written = {**common, **case}
+    written = _merged(common, case)
     arguments = {key: value for key, value in written.items() if key not in ("gives", "method", "precision")}
     expected, bound = None, None
     if "gives" in written:
@@ -141,6 +141,15 @@ def _case(common: Mapping[str, Any], case: Mapping[str, Any], precision: Any) ->
         bound,
         written,
     )
+
+
+def _merged(common: Mapping[str, Any], case: Mapping[str, Any]) -> dict[str, Any]:
+    """What a case adds to a mapping that the cases share, such as `config`, or has in its place."""
+    merged = {**common, **case}
+    for key in common.keys() & case.keys():
+        if isinstance(common[key], dict) and not _is_array(common[key]) and isinstance(case[key], dict):
+            merged[key] = {**common[key], **case[key]}
+    return merged
 
 
 def _argument(name: str, written: Any) -> Any:

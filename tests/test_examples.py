@@ -1,6 +1,7 @@
 """The worked numbers of the chapters (spec/examples): the reference gives every one of them, and the chapters print
 them."""
 
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,8 @@ from conformance.check import Run
 from conformance.requirements import chapter_of, requirements
 from conformance.worked import Worked, worked
 from docs import examples as pages
-from spec.worked import ROWS, examples
+from spec import profiles
+from spec.worked import ROWS, allowed, examples, number
 
 ROOT = Path(__file__).resolve().parent.parent
 CASES = [case for row in ROWS for case in worked(row)]
@@ -36,6 +38,42 @@ def test_the_reference_gives_the_worked_numbers(case: Worked) -> None:
             agrees(call, getattr(made, call.function) if call.function else made)
     else:
         agrees(case, made)
+
+
+@pytest.mark.parametrize("profile", profiles())
+def test_an_example_sets_every_hyperparameter_that_matters(profile: str) -> None:
+    for case in (case for row in ROWS for case in worked(row, profile=profile) if not case.calls):
+        agrees(case, getattr(load_adapter("numpy"), case.function))
+
+
+def test_an_unknown_name_is_answered_with_the_known_ones() -> None:
+    with pytest.raises(ValueError, match=r"no example 'a retrun'; known: a return by hand, "):
+        worked("returns", "a retrun")
+    with pytest.raises(ValueError, match=r"unknown row 'return'; known: .*returns"):
+        worked("return")
+
+
+@pytest.mark.parametrize(
+    ("written", "precision", "expected"),
+    [
+        (Decimal("1.50"), "printed", 0.005),
+        (Decimal("1.50"), "exact", 0.0),
+        (Decimal("-2.0"), 1e-3, 2e-3),
+        (3, "printed", 3e-12),
+        ("1 - 1/2", "printed", 5e-13),
+        (0, 1e-3, 0.0),
+        (Decimal("inf"), "printed", 0.0),
+    ],
+)
+def test_what_a_number_allows(written: Any, precision: Any, expected: float) -> None:
+    assert allowed(written, precision) == pytest.approx(expected, rel=1e-15)
+
+
+def test_formulas_are_numbers_and_nothing_else() -> None:
+    assert number("(1 - 1/4)**2 + ln(e)") == 1.5625
+    for wrong in ("1 +", "__import__('os')", "x", "ln(1, 2)", "1/0"):
+        with pytest.raises(ValueError, match="expected a number or a formula"):
+            number(wrong)
 
 
 @pytest.mark.parametrize("example", EXAMPLES, ids=[f"{example.row}: {example.name}" for example in EXAMPLES])

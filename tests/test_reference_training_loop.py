@@ -114,6 +114,10 @@ def test_environment_action_refuses():
         environment_action([np.nan], Spaces({"x": Vector(1)}, {"a": Vector(1)}), {"a": [0]}, {"a": [1]})
 
 
+def test_flags_come_in_their_order():
+    assert list(step_flags(True, False, False)) == ["is_first", "is_last", "is_terminal"]
+
+
 def test_types_of_a_record():
     made = make_record({"x": np.float32([4])}, 2.5, step_flags(False, False, False), [1.7], [0.5], np.eye(3)[[2]])
     assert {key: value.dtype.name for key, value in made.items()} == {
