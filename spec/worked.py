@@ -14,7 +14,8 @@ A file is a list of examples, each a call of one function with numbers that a re
 `precision` says how near a result must be: "exact", in every bit; "printed", half a unit of the last digit that is
 written (whole numbers and formulas: 1e-12 of the number); a number, relative; or a table of these, for the parts of a
 result. Several calls share a table: `cases` lists what each adds or has otherwise, its `gives` included. `calls` lists
-calls of one object in their order, each by its `method`, with its arguments in their order.
+calls of one object in their order, each by its `method`, with its arguments in their order. Both may have a `precision`
+of their own.
 
 An array is written as a list, or as a table with its `shape`: all `values` in row-major order, or one row that is
 repeated, or `others`, the number that fills it, and single entries, `127 = 0.5` or `"1, 1" = 1`. Arrays hold float64
@@ -104,28 +105,39 @@ def examples(row: str) -> dict[str, Example]:
     if row not in ROWS:
         raise ValueError(f"unknown row {row!r}; known: {', '.join(ROWS)}")
     text = resources.files("spec").joinpath("examples", f"{row}.toml").read_text(encoding="utf-8")
-    return {name: _example(row, name, entry) for name, entry in tomllib.loads(text, parse_float=Decimal).items()}
+    return {name: read(row, name, entry) for name, entry in tomllib.loads(text, parse_float=Decimal).items()}
 
 
-def _example(row: str, name: str, entry: dict[str, Any]) -> Example:
+KEYS = ("requirements", "function", "with", "gives", "cases", "calls", "precision", "text")
+
+
+def read(row: str, name: str, entry: Mapping[str, Any]) -> Example:
+    """One entry of a file.
+
+    Raises:
+      ValueError: it cannot be read; the message names it.
+    """
     try:
-        entry = dict(entry)
-        about = {key: entry.pop(key) for key in ("requirements", "function", "text")}
-        arguments, precision = entry.pop("with", {}), entry.pop("precision")
-        if calls := entry.pop("calls", None):
-            cases = [_case({}, case, precision) for case in calls]
-        else:
-            several = entry.pop("cases", None) or [{"gives": entry.pop("gives")}]
-            cases = [_case(arguments, case, precision) for case in several]
-        if entry:
-            raise ValueError(f"unknown keys: {', '.join(entry)}")
-    except (KeyError, ValueError) as error:
+        _check_keys(entry)
+        arguments, calls = entry.get("with", {}), "calls" in entry
+        several = entry.get("calls") or entry.get("cases") or [{"gives": entry["gives"]}]
+        cases = [_case({} if calls else arguments, case, entry["precision"]) for case in several]
+        given = {key: _argument(key, value) for key, value in arguments.items()}
+    except ValueError as error:
         raise ValueError(f"spec/examples/{row}.toml: {name!r}: {error}") from error
-    requirements = tuple(about.pop("requirements"))
-    given = {key: _argument(key, value) for key, value in arguments.items()}
-    return Example(
-        row, name, requirements, arguments=given, written=arguments, cases=tuple(cases), calls=bool(calls), **about
-    )
+    requirements, function, text = tuple(entry["requirements"]), entry["function"], entry["text"]
+    return Example(row, name, requirements, function, text, given, arguments, tuple(cases), calls)
+
+
+def _check_keys(entry: Mapping[str, Any]) -> None:
+    if unknown := entry.keys() - set(KEYS):
+        raise ValueError(f"unknown keys: {', '.join(sorted(unknown))}; known: {', '.join(KEYS)}")
+    if missing := {"requirements", "function", "precision", "text"} - entry.keys():
+        raise ValueError(f"missing keys: {', '.join(sorted(missing))}")
+    if len({"gives", "cases", "calls"} & entry.keys()) != 1:
+        raise ValueError("expected one of gives, cases and calls")
+    if not all("gives" in case for case in entry.get("cases", [])):
+        raise ValueError("each of the cases needs its gives")
 
 
 def _case(common: Mapping[str, Any], case: Mapping[str, Any], precision: Any) -> Case:

@@ -13,7 +13,7 @@ from conformance.requirements import chapter_of, requirements
 from conformance.worked import Worked, worked
 from docs import examples as pages
 from spec import profiles
-from spec.worked import ROWS, allowed, examples, number
+from spec.worked import ROWS, allowed, examples, number, read
 
 ROOT = Path(__file__).resolve().parent.parent
 CASES = [case for row in ROWS for case in worked(row)]
@@ -74,6 +74,23 @@ def test_formulas_are_numbers_and_nothing_else() -> None:
     for wrong in ("1 +", "__import__('os')", "x", "ln(1, 2)", "1/0"):
         with pytest.raises(ValueError, match="expected a number or a formula"):
             number(wrong)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"give": 1}, "unknown keys: give"),
+        ({"text": None}, "missing keys: text"),
+        ({"cases": [{"gives": 1}]}, "one of gives, cases and calls"),
+        ({"gives": None, "cases": [{"x": 1}]}, "needs its gives"),
+        ({"gives": "one"}, "expected a number or a formula, got 'one'"),
+        ({"with": {"spaces": {"observations": {"x": "Vektor(1)"}}}}, r"expected a space such as Vector\(2\)"),
+    ],
+)
+def test_a_wrong_entry_is_named(change: dict[str, Any], message: str) -> None:
+    entry = {"requirements": ["TRA-3"], "function": "symlog", "gives": 1, "precision": "exact", "text": "1", **change}
+    with pytest.raises(ValueError, match=rf"spec/examples/transforms.toml: 'an example': .*{message}"):
+        read("transforms", "an example", {key: value for key, value in entry.items() if value is not None})
 
 
 @pytest.mark.parametrize("example", EXAMPLES, ids=[f"{example.row}: {example.name}" for example in EXAMPLES])
