@@ -1,4 +1,4 @@
-"""Fills the generated parts of the Markdown files: quoted code and tables of numbers.
+"""Fills the generated parts of the Markdown files: quoted code, tables of numbers and worked numbers.
 
 `python -m docs.render` (or `make docs`) writes them, `--check` only compares.
 
@@ -8,6 +8,8 @@ A part stands between a marker line and an end line, and is never edited by hand
   <!-- end quote -->
   <!-- table: hyperparameters -->                               one of TABLES, each a table or more
   <!-- end table -->
+  <!-- examples: returns; a return by hand -->              worked numbers of a row, all or by name: docs/examples.py
+  <!-- end examples -->
 """
 
 import ast
@@ -23,13 +25,13 @@ from typing import Any
 from conformance.commands.mutants import is_named
 from conformance.reports import summary
 from conformance.requirements import chapter_of, requirements
-from docs import strangers
+from docs import examples, strangers
 from dreamer_spec.report import catalogue
 from spec import Edition, benchmarks, editions, hyperparameters, profiles, sizes
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "docs" / "results"
-PART = re.compile(r"(<!-- (quote|table): ([^>]*?) -->\n).*?(<!-- end \2 -->)", re.DOTALL)
+PART = re.compile(r"(<!-- (quote|table|examples): ([^>]*?) -->\n).*?(<!-- end \2 -->)", re.DOTALL)
 
 
 def quote(argument: str) -> str:
@@ -381,12 +383,19 @@ TABLES: dict[str, Callable[[], str]] = {
 }
 
 
+KINDS: dict[str, Callable[[str], str]] = {
+    "quote": quote,
+    "table": lambda name: TABLES[name](),
+    "examples": examples.markdown,
+}
+
+
 def render(text: str) -> str:
     """The text with every generated part made anew."""
 
     def part(match: re.Match[str]) -> str:
         start, kind, argument, end = match.groups()
-        content = quote(argument) if kind == "quote" else TABLES[argument]()
+        content = KINDS[kind](argument)
         return f"{start}\n{content}\n{end}"
 
     return PART.sub(part, text)

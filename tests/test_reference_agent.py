@@ -19,7 +19,7 @@ from spec.config import load_config
 from spec.parameters import parameter_table
 from spec.spaces import Discrete, Image, Spaces, Vector
 
-LN_255 = 5.541263545158426
+LN_255 = math.log(255)
 TOY = Spaces({"vector": Vector(3)}, {"move": Discrete((2,))})
 RICH = Spaces(
     {"image": Image(16, 16, 1), "code": Discrete((2, 3)), "vector": Vector(2)},
@@ -138,7 +138,7 @@ def test_checkpoint_round_trip_and_refusal():
 
 
 def test_first_step_is_exact():
-    """Spec/10-agent.md, worked number 3."""
+    """A fresh agent's losses: spec/10-agent.md, worked numbers."""
     config = toy_config()
     _, aux = evaluate(fresh(config, TOY), config, TOY)
     assert aux["losses"]["reward"] == pytest.approx(LN_255, rel=1e-14)

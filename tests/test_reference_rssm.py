@@ -1,4 +1,4 @@
-"""Numbers of spec/04-rssm.md that a reader can check by hand, and exact properties of the reference."""
+"""Exact properties of the recurrent model. The numbers of spec/04-rssm.md are in tests/test_examples.py."""
 
 import math
 
@@ -50,27 +50,6 @@ def run(params, inputs, config):
     return rssm.observe(params, **inputs, config=config)
 
 
-@pytest.mark.parametrize(
-    ("reset", "candidate", "update", "before", "after"),
-    [(0.0, 1.0, 1.0, 0.2, 0.331059), (1.0, 2.0, 0.0, -0.5, -0.124003), (0.0, 0.0, 0.0, 1.0, 0.731059)],
-)
-def test_gates(reset, candidate, update, before, after):
-    config = small_config(deter=1, blocks=1)
-    params = zero_params(config) | {"rssm/gru/bias": np.array([reset, candidate, update])}
-    deter = rssm.core(params, [[before]], np.zeros((1, 2, 3)), np.zeros((1, ACTION)), config)
-    np.testing.assert_allclose(deter, [[after]], atol=1e-6)
-
-
-def test_gates_are_split_inside_each_block():
-    config = small_config()
-    c = np.arctanh([0.1, 0.2, 0.3, 0.4])
-    bias = np.array([100, 100, c[0], c[1], 100, 100, 100, 100, c[2], c[3], 100, 100])
-    deter = rssm.core(
-        zero_params(config) | {"rssm/gru/bias": bias}, np.ones(4), np.zeros((2, 3)), np.zeros(ACTION), config
-    )
-    np.testing.assert_allclose(deter, [0.1, 0.2, 0.3, 0.4], atol=1e-12)
-
-
 def test_input_of_the_blocks(monkeypatch):
     config = small_config(units=1)
     embeddings = {"rssm/embed_deter": [7.0], "rssm/embed_stoch": [8.0], "rssm/embed_action": [9.0]}
@@ -100,21 +79,6 @@ def test_embedded_values(monkeypatch):
     np.testing.assert_allclose(seen["rssm/embed_action"], [-1.1, 0.6, 1.1])
 
 
-def test_hidden_layer_is_normalized_over_all_blocks():
-    """With equal gates, units of different blocks differ only through the hidden layer: one large block shrinks the
-    other."""
-    config = small_config(norm_epsilon=1e-30)
-    params = zero_params(config)
-    params["rssm/hidden/bias"] = np.array([1.0, 1.0, 7.0, 7.0])
-    params["rssm/hidden/scale"] = np.ones(4)
-    params["rssm/gru/kernel"][:, 0, 2] = 1.0  # candidate of each block's first unit
-    params["rssm/gru/bias"] = np.array([100.0, 100, 0, 0, 100, 100] * 2)
-    deter = rssm.core(params, np.zeros(4), np.zeros((2, 3)), np.zeros(ACTION), config)
-    normalized = np.array([1.0, 7.0]) / 5.0  # root of (1 + 1 + 49 + 49) / 4
-    expected = np.tanh(normalized / (1 + np.exp(-normalized)))
-    np.testing.assert_allclose(deter, [expected[0], 0, expected[1], 0], atol=1e-12)
-
-
 def test_logits_of_prior_and_posterior():
     config = small_config()
     bias = np.arange(6.0)
@@ -135,27 +99,6 @@ def test_posterior_reads_memory_then_tokens(monkeypatch):
     )
     rssm.posterior(zero_params(config), [1.0, 2, 3, 4], [5.0, 6, 7, 8, 9], config)
     assert seen[0].tolist() == [1, 2, 3, 4, 5, 6, 7, 8, 9]
-
-
-@pytest.mark.parametrize(
-    ("uniform", "unimix", "index"), [(0.251, 0.01, 0), (0.253, 0.01, 1), (0.251, 0.0, 1), (0.0, 0.01, 0)]
-)
-def test_sampling_uses_the_mixture(uniform, unimix, index):
-    config = small_config(stoch=1, classes=2, latent_unimix=unimix)
-    logits = [0.0, math.log(3.0)]
-    params = zero_params(config) | {
-        "rssm/prior/out/bias": np.array(logits),
-        "rssm/posterior/out/bias": np.array(logits),
-    }
-    carry = {"deter": np.zeros((1, 4)), "stoch": np.zeros((1, 1, 2))}
-    expected = np.eye(2)[index].tolist()
-    states = rssm.imagine(params, carry, lambda feature, t: np.zeros((1, ACTION)), [[[uniform]]], config)
-    assert states["stoch"][0, 1, 0].tolist() == expected
-    state, returned = rssm.observe_step(
-        params, carry, np.zeros((1, TOKENS)), np.zeros((1, ACTION)), [False], [[uniform]], config
-    )
-    assert state["stoch"][0, 0].tolist() == expected
-    np.testing.assert_allclose(returned, [[logits]])
 
 
 def test_straight_through_gradient():

@@ -1,4 +1,4 @@
-"""Literal numbers of spec/01-transforms.md."""
+"""Transforms: exact properties and edge cases. The numbers of spec/01-transforms.md are in tests/test_examples.py."""
 
 import numpy as np
 import pytest
@@ -6,19 +6,6 @@ import pytest
 from reference_numpy.transforms import exponential_bins, ordered_expectation, symexp, symlog, twohot
 
 SMALL = [-3.0, -1.0, 0.0, 1.0, 3.0]
-
-
-def test_symlog():
-    np.testing.assert_allclose(
-        symlog([1.0, -10.0, 100.0]), [0.6931471805599453, -2.3978952727983707, 4.61512051684126], rtol=1e-15
-    )
-    assert symlog(1e-8) == pytest.approx(9.999999950000001e-09, rel=1e-15)
-
-
-def test_symexp():
-    np.testing.assert_allclose(
-        symexp([1.0, -2.0, 20.0]), [1.718281828459045, -6.38905609893065, 485165194.4097903], rtol=1e-15
-    )
 
 
 def test_symlog_and_symexp_are_inverse():
@@ -29,7 +16,6 @@ def test_symlog_and_symexp_are_inverse():
 def test_special_values():
     np.testing.assert_array_equal(symlog([0.0, -0.0, np.inf, -np.inf, np.nan]), [0, 0, np.inf, -np.inf, np.nan])
     np.testing.assert_array_equal(symexp([0.0, -0.0, np.inf, -np.inf, np.nan]), [0, 0, np.inf, -np.inf, np.nan])
-    np.testing.assert_allclose(symlog([1e30, -3e38]), [69.07755278982137, -88.59684582244185], rtol=1e-15)
     np.testing.assert_array_equal(symexp([3e38, -1e30]), [np.inf, -np.inf])
     np.testing.assert_allclose(symlog([1e-40, 5e-324]), [1e-40, 5e-324], atol=2.3e-308)
     np.testing.assert_allclose(symexp([1e-40, -5e-324]), [1e-40, -5e-324], atol=2.3e-308)
@@ -38,13 +24,8 @@ def test_special_values():
 def test_bins():
     bins = exponential_bins(255)
     assert bins.shape == (255,)
-    np.testing.assert_allclose(bins[127:133], [0, 0.17055772, 0.37020536, 0.60390446, 0.87746274, 1.1976785], atol=1e-8)
-    np.testing.assert_allclose(bins[[0, 254]], [-485165194.4097903, 485165194.4097903], rtol=1e-14)
     np.testing.assert_array_equal(bins, -bins[::-1])
     assert np.all(np.diff(bins) > 0)
-    np.testing.assert_allclose(
-        exponential_bins(5), [-485165194.41, -22025.4658, 0, 22025.4658, 485165194.41], rtol=1e-9
-    )
 
 
 @pytest.mark.parametrize("bins", [0, 1, 2, 254])
@@ -56,30 +37,19 @@ def test_bins_refuse_even_and_small_numbers(bins):
 @pytest.mark.parametrize(
     ("x", "expected"),
     [
-        (2.0, [0, 0, 0, 0.5, 0.5]),
-        (-0.25, [0, 0.25, 0.75, 0, 0]),
-        (1.0, [0, 0, 0, 1, 0]),
-        (-3.0, [1, 0, 0, 0, 0]),
-        (3.0, [0, 0, 0, 0, 1]),
-        (7.0, [0, 0, 0, 0, 1]),
         (-np.inf, [1, 0, 0, 0, 0]),
         (np.inf, [0, 0, 0, 0, 1]),
         (-0.0, [0, 0, 1, 0, 0]),
         (np.nan, [np.nan] * 5),
     ],
 )
-def test_twohot(x, expected):
+def test_twohot_of_special_numbers(x, expected):
     np.testing.assert_array_equal(twohot(x, SMALL), expected)
 
 
-@pytest.mark.parametrize(
-    ("x", "lower", "weight"),
-    [(0.1, 127, 0.4136882061551783), (1.0, 131, 0.6173290787033168), (300.0, 163, 0.7740168904329725)],
-)
-def test_twohot_interpolates_in_raw_space(x, lower, weight):
+@pytest.mark.parametrize("x", [0.1, 1.0, 300.0])
+def test_twohot_interpolates_in_raw_space(x):
     weights = twohot(x, exponential_bins(255))
-    assert weights[lower] == pytest.approx(weight, rel=1e-12)
-    assert weights[lower + 1] == pytest.approx(1 - weight, rel=1e-12)
     assert np.count_nonzero(weights) == 2
     assert weights @ exponential_bins(255) == pytest.approx(x, rel=1e-12)
 
@@ -87,17 +57,11 @@ def test_twohot_interpolates_in_raw_space(x, lower, weight):
 def test_twohot_keeps_leading_axes():
     weights = twohot([[2.0, 7.0], [1.0, -3.0]], SMALL)
     assert weights.shape == (2, 2, 5)
-    np.testing.assert_array_equal(weights[0, 1], [0, 0, 0, 0, 1])
-
-
-def test_ordered_expectation():
-    assert ordered_expectation([0.1, 0.2, 0.3, 0.15, 0.25], SMALL) == pytest.approx(0.4, rel=1e-14)
-    np.testing.assert_allclose(ordered_expectation([[0, 0, 0, 1, 0], [0.5, 0.5, 0, 0, 0]], SMALL), [1.0, -2.0])
+    np.testing.assert_array_equal(weights[0, 1], twohot(7.0, SMALL))
 
 
 def test_ordered_expectation_of_symmetric_probabilities_is_exactly_zero():
     bins = exponential_bins(255)
-    assert ordered_expectation(np.full(255, 1 / 255), bins) == 0.0
     half = np.random.default_rng(0).random(127)
     probs = np.concatenate([half, [0.3], half[::-1]])
     assert ordered_expectation(probs / probs.sum(), bins) == 0.0
