@@ -458,7 +458,7 @@ def test_an_implementation_with_given_samples_passes(name: str) -> None:
         (Forgetful, "observe_given_matches"),
         (Early, "observe_given_matches"),
         (Ignorant, "imagine_given_matches"),
-        (Ignorant, "losses_given_match"),
+        (Ignorant, "critic_matches"),
     ],
 )
 def test_mistakes_with_given_samples_are_found(mistaken: type[NumpyAdapter], name: str) -> None:

@@ -132,7 +132,7 @@ def test_only_relevant_checks_are_run() -> None:
     """Those that call what the mutant changes come first; a check that cannot reach it is left out."""
     names = [check.name for check in relevant(MUTANTS["return_bootstraps_from_itself"], reach())]
     assert names[0].startswith("returns.lambda_return")
-    assert "agent.losses_match" in names
+    assert "losses.total_matches" in names
     assert "optimizer.laprop_matches" not in names
     queue = MUTANTS["no_online_queue"]
     assert {check.name.partition(".")[0] for check in relevant(queue, reach())} == {"replay"}
@@ -192,5 +192,5 @@ def test_swapped_weights_of_the_kl_losses_are_seen(monkeypatch: pytest.MonkeyPat
     right, swapped = torch_agent.loss_scale, {"dynamics": "representation", "representation": "dynamics"}
     monkeypatch.setattr(torch_agent, "loss_scale", lambda name, config: right(swapped.get(name, name), config))
     checks = {check.name: check for check in CHECKS}
-    for name, status in (("agent.losses_match", "pass"), ("agent.total_gradient_is_the_weighted_sum", "fail")):
+    for name, status in (("losses.total_matches", "pass"), ("agent.total_gradient_is_the_weighted_sum", "fail")):
         assert run_check(checks[name], load_adapter("torch"), Setting("float64", "paper")).status == status
