@@ -14,7 +14,7 @@ from conformance.adapter import load_adapter
 from conformance.adapters.numpy_adapter import NumpyAdapter
 from conformance.case import Setting
 from conformance.compare import Worst
-from conformance.diagnosis import Diagnosis, diagnose
+from conformance.diagnosis import VALUES, Diagnosis, diagnose
 from conformance.execute import Result, run_check, selected_checks
 from conformance.mutants import MUTANTS, MutantAdapter, PlantedAdapter, relevant, sound, trial
 from impl_torch import agent as torch_agent
@@ -62,10 +62,10 @@ def test_a_mistake_in_a_backend_is_named(dtype: str, monkeypatch: pytest.MonkeyP
     for module in (torch_returns, torch_agent):
         monkeypatch.setattr(module, "lambda_return", wrong)
     (found,) = diagnose_in(
-        load_adapter("torch", dtype), "lambda_return_literals", "lambda_return_matches", "losses_match", dtype=dtype
+        load_adapter("torch", dtype), "lambda_return_literals", "lambda_return_matches", *VALUES, dtype=dtype
     )
     assert (found.mutant.name, found.alternatives, found.unexplained) == ("return_without_continue", (), ())
-    assert {"returns.lambda_return_literals", "agent.losses_match"} <= set(found.explained)
+    assert {"returns.lambda_return_literals", "losses.actor_matches"} <= set(found.explained)
 
 
 def test_a_missing_gradient_in_a_backend_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -74,7 +74,7 @@ def test_a_missing_gradient_in_a_backend_is_named(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(
         torch_world_model, "kl_losses", functools.wraps(right)(lambda *arguments: right(*arguments)[::-1])
     )
-    (found,) = diagnose_in(load_adapter("torch", "float32"), "losses_match", "constants_of_the_kl", dtype="float32")
+    (found,) = diagnose_in(load_adapter("torch", "float32"), *VALUES, "constants_of_the_kl", dtype="float32")
     assert (found.mutant.name, found.alternatives, found.unexplained) == ("kl_stop_gradients_swapped", (), ())
 
 

@@ -196,38 +196,25 @@ def reach(where: str, names: list[str], labels: list[str]) -> Callable[[Comparis
     return relation
 
 
-@check(*INTO_THE_WORLD_MODEL, "WM-1", "WM-17", uses=["loss_derivatives"], level=2, dtypes=WHOLE)
-def derivatives_of_reconstructions_match(setting: Setting) -> Cases:
-    """The reconstruction losses train the decoder and what the states are made of."""
-    yield from derivatives(setting, "reconstruction")
+@check(
+    *(*INTO_THE_WORLD_MODEL, "WM-1", "WM-11", "WM-12", "WM-13", "WM-14", "WM-17"),
+    uses=["loss_derivatives"],
+    level=2,
+    dtypes=WHOLE,
+)
+def derivatives_of_the_world_model_match(setting: Setting) -> Cases:
+    """The losses of decoder, reward and continue head train their part and what the states are made of; the dynamics
+    loss trains the prior, the representation loss does not, and both train what memories are made of."""
+    yield from derivatives(setting, "reconstruction", "reward", "continue", "dynamics", "representation")
 
 
-@check(*INTO_THE_WORLD_MODEL, "WM-1", "WM-17", uses=["loss_derivatives"], level=2, dtypes=WHOLE)
-def derivatives_of_reward_and_continue_match(setting: Setting) -> Cases:
-    """The losses of the reward head and the continue head train their head and what the states are made of."""
-    yield from derivatives(setting, "reward", "continue")
-
-
-@check(*INTO_THE_WORLD_MODEL, "WM-11", "WM-12", "WM-13", "WM-14", uses=["loss_derivatives"], level=2, dtypes=WHOLE)
-def derivatives_of_dynamics_and_representation_match(setting: Setting) -> Cases:
-    """The dynamics loss trains the prior, the representation loss does not, and both train what memories are made
-    of."""
-    yield from derivatives(setting, "dynamics", "representation")
-
-
-@check(*FLOW, "RSSM-25", "RET-18", "BEH-5", "BEH-10", uses=["loss_derivatives"], level=2, dtypes=WHOLE)
-def derivatives_of_actor_match(setting: Setting) -> Cases:
-    """The loss of the actor trains the actor alone."""
-    yield from derivatives(setting, "actor")
-
-
-@check(*FLOW, "CON-15", "RSSM-25", "RET-18", "BEH-13", uses=["loss_derivatives"], level=2, dtypes=WHOLE)
-def derivatives_of_critic_match(setting: Setting) -> Cases:
-    """The loss of the critic at imagined states trains the critic alone."""
-    yield from derivatives(setting, "critic")
-
-
-@check(*INTO_THE_WORLD_MODEL, "RET-18", "BEH-15", uses=["loss_derivatives"], level=2, dtypes=WHOLE)
-def derivatives_of_replay_critic_match(setting: Setting) -> Cases:
-    """The loss of the critic at replayed states trains the critic and what the states are made of."""
-    yield from derivatives(setting, "replay_critic")
+@check(
+    *(*INTO_THE_WORLD_MODEL, "RSSM-25", "RET-18", "BEH-5", "BEH-10", "BEH-13", "BEH-15"),
+    uses=["loss_derivatives"],
+    level=2,
+    dtypes=WHOLE,
+)
+def derivatives_of_actor_and_critic_match(setting: Setting) -> Cases:
+    """The losses of actor and critic at imagined states train the actor and the critic alone; that of the critic at
+    replayed states trains what the states are made of, too."""
+    yield from derivatives(setting, "actor", "critic", "replay_critic")
