@@ -1,10 +1,16 @@
-"""Shape checks shared by the modules of the reference."""
+"""Checks of arguments.
 
+An error names the argument, what was expected and what came. The `require` functions are the same in every column.
+"""
+
+from collections.abc import Iterable, Mapping
 from types import EllipsisType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+LISTED = 8  # problems that one message names
 
 
 def checked(name: str, value: Any, *expected: int | str | EllipsisType) -> NDArray[np.float64]:
@@ -13,8 +19,7 @@ def checked(name: str, value: Any, *expected: int | str | EllipsisType) -> NDArr
     Args:
       name: what the message calls the argument.
       value: anything that converts to an array of real numbers.
-      expected: one entry for each axis: a length, or a letter for any length; a leading `...` stands for any number of
-        axes.
+      expected: see `require_shape`.
 
     Raises:
       ValueError: the shape differs; the message holds the name, the expected shape and the shape that came.
@@ -24,15 +29,48 @@ def checked(name: str, value: Any, *expected: int | str | EllipsisType) -> NDArr
     return array
 
 
-def require_shape(name: str, shape: tuple[int, ...], *expected: int | str | EllipsisType) -> None:
-    """Compares a shape with `expected`, in the notation of `checked`. Implements [CON-8].
+def require(condition: bool, name: str, expected: object, got: object) -> None:
+    """Raises ValueError unless the condition holds."""
+    if not condition:
+        raise ValueError(f"{name}: expected {expected}, got {got}")
 
-    Raises:
-      ValueError: they differ.
+
+def require_shape(name: str, shape: tuple[int, ...], *expected: int | str | EllipsisType) -> None:
+    """Raises ValueError unless the shape is the expected one. [CON-8]
+
+    expected: for each axis its length, or a letter for any length; a leading `...` stands for any number of axes.
     """
-    axes = expected[1:] if expected and expected[0] is ... else expected
-    last = shape[len(shape) - len(axes) :] if len(shape) >= len(axes) else shape
-    fits = len(shape) == len(axes) or (len(axes) < len(expected) and len(shape) > len(axes))
-    if not fits or any(isinstance(axis, int) and axis != length for axis, length in zip(axes, last, strict=True)):
+    axes = expected[1:] if expected[:1] == (...,) else expected
+    last = shape[max(0, len(shape) - len(axes)) :] if len(axes) < len(expected) else shape
+    if last == axes:  # the usual case, at little cost: a train step of eager code comes here a thousand times
+        return
+    fits = [isinstance(axis, str) or axis == length for axis, length in zip(axes, last, strict=False)]
+    if len(last) != len(axes) or not all(fits):
         wanted = ", ".join("..." if axis is ... else str(axis) for axis in expected)
-        raise ValueError(f"{name}: expected shape [{wanted}], got [{', '.join(map(str, shape))}]")
+        raise ValueError(f"{name}: expected shape [{wanted}], got {list(shape)}")
+
+
+def require_keys(name: str, given: Iterable[str], expected: Iterable[str], exactly: bool = False) -> None:
+    """Raises ValueError unless all expected keys are given and, with `exactly`, no others."""
+    given, expected = set(given), set(expected)
+    if exactly or not expected <= given:
+        _refuse(name, _differences(given, expected))
+
+
+def require_shapes(name: str, arrays: Mapping[str, Any], expected: Mapping[str, tuple[int, ...]]) -> None:
+    """Raises ValueError unless the arrays have exactly these names and shapes. [CON-8]"""
+    differing = [key for key in expected if key in arrays and np.shape(arrays[key]) != expected[key]]
+    wrong = [f"{key!r} has shape {list(np.shape(arrays[key]))}, expected {list(expected[key])}" for key in differing]
+    _refuse(name, _differences(set(arrays), set(expected)) + wrong)
+
+
+def _differences(given: set[str], expected: set[str]) -> list[str]:
+    missing, unknown = sorted(expected - given), sorted(given - expected)
+    return [f"missing {key!r}" for key in missing] + [f"unknown {key!r}" for key in unknown]
+
+
+def _refuse(name: str, problems: list[str]) -> None:
+    """Raises ValueError if there are problems, and names the first few: a parameter table has hundreds of entries."""
+    if problems:
+        more = [f"{len(problems) - LISTED} more"] if len(problems) > LISTED else []
+        raise ValueError(f"{name}: {'; '.join(problems[:LISTED] + more)}")
