@@ -13,7 +13,7 @@ from impl_jax import behavior, networks, returns, rssm
 from impl_jax.distributions import bernoulli_mean, symexp_twohot_mean
 from impl_jax.layers import Params, truncated_normal
 from impl_jax.optimizer import initial_optimizer_state, optimizer_step_with_metrics
-from impl_jax.shapes import require_keys, require_shape, require_shapes, wide_dtype, widen
+from impl_jax.shapes import require_keys, require_observations, require_shape, require_shapes, wide_dtype, widen
 from impl_jax.transforms import exponential_bins
 from impl_jax.world_model import continue_target, world_model_losses
 from spec import Config, Parameter, Spaces, parameter_table
@@ -76,7 +76,7 @@ def policy_step(
     require_shape("prev_action", prev_action.shape, N, spaces.action_size)
     require_shape("noise['posterior']", noise["posterior"].shape, N, config.stoch)
     require_shape("noise['action']", noise["action"].shape, N, spaces.action_noise_size)
-    networks.require_observations("observation", observation, spaces, (N,))
+    require_observations("observation", observation, spaces, (N,))
     tokens = networks.encoder(params, observation, spaces, config)
     carry, _ = rssm.observe_step(params, carry, tokens, prev_action, is_first, noise["posterior"], config)
     outputs = networks.actor(params, networks.feature(carry["deter"], carry["stoch"]), spaces, config)
@@ -134,7 +134,7 @@ def _require_batch(batch: Arrays, noise: Arrays, spaces: Spaces, config: Config)
     # B and T are what most arrays say, so that the error names the one that differs.
     steps = (*spaces.observations, *flags, "prev_action")
     B, T = statistics.mode((*batch[key].shape, 0, 0)[:2] for key in steps)
-    networks.require_observations("batch", batch, spaces, (B, T))
+    require_observations("batch", batch, spaces, (B, T))
     for key in flags:
         require_shape(f"batch[{key!r}]", batch[key].shape, B, T)
     require_shape("batch['prev_action']", batch["prev_action"].shape, B, T, spaces.action_size)

@@ -3,9 +3,6 @@
 They return raw outputs, those of the decoder and the heads in float32 or better. [NET-26]
 """
 
-from collections.abc import Mapping
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 
@@ -21,12 +18,10 @@ from impl_jax.layers import (
     transposed_convolution,
     upsampled_convolution,
 )
-from impl_jax.shapes import compute_dtype, require, require_keys, require_shape, wide_dtype
+from impl_jax.shapes import Observations, compute_dtype, require_observations, require_shape, wide_dtype
 from impl_jax.transforms import symlog
-from spec import Config, Discrete, Image, Spaces, Vector
+from spec import Config, Discrete, Spaces, Vector
 from spec.parameters import bottleneck
-
-Observations = Mapping[str, jax.Array]
 
 
 def feature(deter: jax.Array, stoch: jax.Array) -> jax.Array:
@@ -56,28 +51,6 @@ def encoder(params: Params, observations: Observations, spaces: Spaces, config: 
         x = (x / 255.0 - 0.5).astype(compute_dtype(config))  # [..., H, W, channels]; rounded once, here
         tokens.append(_image_encoder(params, x, config).reshape(*leading, -1))  # [..., h0*w0*c0]
     return jnp.concatenate(tokens, -1)
-
-
-def require_observations(
-    name: str, observations: Observations, spaces: Spaces, leading: tuple[Any, ...] = (...,)
-) -> tuple[int, ...]:
-    """The leading axes of all observations, after checks of names, dtypes and shapes. [NET-2], [NET-4], [NET-6]
-
-    leading: what these axes must be, in the notation of `require_shape`.
-
-    Raises:
-      ValueError: naming the key. [NET-27] Classes of a Discrete are values, which compiled code cannot refuse.
-    """
-    require_keys(name, observations, spaces.observations)
-    for key, space in spaces.observations.items():
-        x = observations[key]
-        require_shape(f"{name}[{key!r}]", x.shape, *leading, *space.array_shape)
-        leading = x.shape[: x.ndim - len(space.array_shape)]  # the first key's, for all others
-        if isinstance(space, Image):
-            require(x.dtype == jnp.uint8, f"{name}[{key!r}]", "dtype uint8", x.dtype)
-        elif isinstance(space, Discrete):
-            require(jnp.issubdtype(x.dtype, jnp.integer), f"{name}[{key!r}]", "an integer dtype", x.dtype)
-    return leading
 
 
 def onehots(x: jax.Array, space: Discrete, dtype: jnp.dtype) -> jax.Array:

@@ -13,7 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from spec import Config
+from spec import Config, Discrete, Image, Spaces
+
+Observations = Mapping[str, jax.Array]
 
 LISTED = 8  # problems that one message names
 
@@ -65,7 +67,7 @@ def require_keys(name: str, given: Iterable[str], expected: Iterable[str], exact
 def require_shapes(name: str, arrays: Mapping[str, Any], expected: Mapping[str, tuple[int, ...]]) -> None:
     """Raises ValueError unless the arrays have exactly these names and shapes. [CON-8]"""
     differing = [key for key in expected if key in arrays and np.shape(arrays[key]) != expected[key]]
-    wrong = [f"{key!r} has shape {list(np.shape(arrays[key]))}, expected {list(expected[key])}" for key in differing]
+    wrong = [f"{key!r}: expected shape {list(expected[key])}, got {list(np.shape(arrays[key]))}" for key in differing]
     _refuse(name, _differences(set(arrays), set(expected)) + wrong)
 
 
@@ -86,3 +88,25 @@ def require_same_shape(**arrays: jax.Array) -> None:
     (_, first), *others = arrays.items()
     for name, array in others:
         require_shape(name, array.shape, *first.shape)
+
+
+def require_observations(
+    name: str, observations: Observations, spaces: Spaces, leading: tuple[Any, ...] = (...,)
+) -> tuple[int, ...]:
+    """The leading axes of all observations, after checks of names, dtypes and shapes. [NET-2], [NET-4], [NET-6]
+
+    leading: what these axes must be, in the notation of `require_shape`.
+
+    Raises:
+      ValueError: naming the key. [NET-27] Classes of a Discrete are values, which compiled code cannot refuse.
+    """
+    require_keys(name, observations, spaces.observations)
+    for key, space in spaces.observations.items():
+        x = observations[key]
+        require_shape(f"{name}[{key!r}]", x.shape, *leading, *space.array_shape)
+        leading = x.shape[: x.ndim - len(space.array_shape)]  # the first key's, for all others
+        if isinstance(space, Image):
+            require(x.dtype == jnp.uint8, f"{name}[{key!r}]", "dtype uint8", x.dtype)
+        elif isinstance(space, Discrete):
+            require(jnp.issubdtype(x.dtype, jnp.integer), f"{name}[{key!r}]", "an integer dtype", x.dtype)
+    return leading

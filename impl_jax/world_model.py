@@ -21,7 +21,15 @@ from impl_jax.distributions import (
     unimix_log_probs,
 )
 from impl_jax.layers import Params
-from impl_jax.shapes import compute_dtype, require, require_keys, require_same_shape, require_shape, wide_dtype
+from impl_jax.shapes import (
+    compute_dtype,
+    require,
+    require_keys,
+    require_observations,
+    require_same_shape,
+    require_shape,
+    wide_dtype,
+)
 from impl_jax.transforms import exponential_bins, symexp
 from spec import Config, Discrete, Image, Spaces, Vector
 
@@ -60,7 +68,7 @@ def reconstruction_losses(
       ValueError: a missing key, or a wrong shape or dtype. [WM-19]
     """
     require_keys("predictions", predictions, spaces.observations)
-    leading = networks.require_observations("observations", observations, spaces)
+    leading = require_observations("observations", observations, spaces)
     result = {}
     for key, space in spaces.observations.items():
         prediction, x = predictions[key], observations[key]
@@ -142,7 +150,7 @@ def open_loop(
     require_shape("prev_action", prev_action.shape, B, T, spaces.action_size)
     require_shape("noise['posterior']", noise["posterior"].shape, B, context, config.stoch)
     require_shape("noise['prior']", noise["prior"].shape, B, T - context, config.stoch)
-    networks.require_observations("observation", observation, spaces, (B, T))
+    require_observations("observation", observation, spaces, (B, T))
 
     known = {key: observation[key][:, :context] for key in spaces.observations}
     tokens = networks.encoder(params, known, spaces, config)

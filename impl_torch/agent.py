@@ -21,13 +21,11 @@ from impl_torch.behavior import (
 from impl_torch.distributions import bernoulli_mean, symexp_twohot_mean
 from impl_torch.layers import Params, for_many_rows, truncated_normal
 from impl_torch.networks import (
-    Observations,
     actor,
     continue_head,
     critic,
     encoder,
     feature,
-    require_observations,
     reward_head,
 )
 from impl_torch.optimizer import optimizer_step
@@ -39,7 +37,14 @@ from impl_torch.returns import (
     update_return_range,
 )
 from impl_torch.rssm import Carry, freeze, imagine_features, observe, observe_step, prepare
-from impl_torch.shapes import require_keys, require_shape, require_shapes, wide_dtype
+from impl_torch.shapes import (
+    Observations,
+    require_keys,
+    require_observations,
+    require_shape,
+    require_shapes,
+    wide_dtype,
+)
 from impl_torch.transforms import standard_bins
 from impl_torch.world_model import continue_target, world_model_losses
 from spec import Config, Parameter, Spaces, parameter_table

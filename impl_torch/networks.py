@@ -5,7 +5,6 @@ All return raw outputs; last layers in float32 or better. Parameters are the fla
 
 import functools
 from collections.abc import Mapping
-from typing import Any
 
 import torch
 import torch.nn.functional as F  # noqa: N812 (so it is called everywhere)
@@ -23,12 +22,11 @@ from impl_torch.layers import (
     transposed_convolution,
     upsample,
 )
-from impl_torch.shapes import compute_dtype, require, require_keys, require_shape, wide_dtype
+from impl_torch.shapes import Observations, compute_dtype, require_observations, require_shape, wide_dtype
 from impl_torch.transforms import symlog
-from spec import Config, Discrete, Image, Spaces, Vector
+from spec import Config, Discrete, Spaces, Vector
 from spec.parameters import bottleneck
 
-Observations = Mapping[str, Tensor]
 Outputs = Mapping[str, Mapping[str, Tensor]]
 # On the CPU this many pixels go through a convolutional network at a time: what one layer hands to the next then stays
 # in the cache.
@@ -57,29 +55,6 @@ def encoder(params: Params, observations: Observations, spaces: Spaces, config: 
         x = _in_chunks(functools.partial(_encode_image, params, config=config), x, x.shape[1] * x.shape[2])
         tokens.append(x.view(*leading, -1))  # [..., h0*w0*c0]
     return torch.cat(tokens, -1)
-
-
-def require_observations(
-    name: str, observations: Observations, spaces: Spaces, leading: tuple[Any, ...] = (...,)
-) -> tuple[int, ...]:
-    """The leading axes of all observations, after checks of names, dtypes and shapes. [NET-2] [NET-4] [NET-6] [NET-27]
-
-    leading: what these axes must be, in the notation of `require_shape`.
-
-    Raises:
-      ValueError: naming the key. Classes of a Discrete are not looked at: that would wait for an accelerator.
-    """
-    require_keys(name, observations, spaces.observations)
-    for key, space in spaces.observations.items():
-        x = observations[key]
-        require_shape(f"{name}[{key!r}]", x.shape, *leading, *space.array_shape)
-        leading = x.shape[: x.ndim - len(space.array_shape)]  # the first key's, for all others
-        if isinstance(space, Image):
-            require(x.dtype == torch.uint8, f"{name}[{key!r}]", "dtype uint8", x.dtype)
-        elif isinstance(space, Discrete):
-            whole = not x.is_floating_point() and x.dtype != torch.bool
-            require(whole, f"{name}[{key!r}]", "an integer dtype", x.dtype)
-    return leading
 
 
 def encode_vector(x: Tensor, space: Vector | Discrete, config: Config) -> Tensor:

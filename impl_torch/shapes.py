@@ -11,7 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spec import Config
+from spec import Config, Discrete, Image, Spaces
+
+Observations = Mapping[str, Tensor]
 
 LISTED = 8  # problems that one message names
 DTYPES = {"float64": torch.float64, "float32": torch.float32, "bfloat16": torch.bfloat16}
@@ -63,7 +65,7 @@ def require_keys(name: str, given: Iterable[str], expected: Iterable[str], exact
 def require_shapes(name: str, arrays: Mapping[str, Any], expected: Mapping[str, tuple[int, ...]]) -> None:
     """Raises ValueError unless the arrays have exactly these names and shapes. [CON-8]"""
     differing = [key for key in expected if key in arrays and np.shape(arrays[key]) != expected[key]]
-    wrong = [f"{key!r} has shape {list(np.shape(arrays[key]))}, expected {list(expected[key])}" for key in differing]
+    wrong = [f"{key!r}: expected shape {list(expected[key])}, got {list(np.shape(arrays[key]))}" for key in differing]
     _refuse(name, _differences(set(arrays), set(expected)) + wrong)
 
 
@@ -84,3 +86,26 @@ def require_same_shape(**arrays: Tensor) -> None:
     (_, first), *others = arrays.items()
     for name, array in others:
         require_shape(name, array.shape, *first.shape)
+
+
+def require_observations(
+    name: str, observations: Observations, spaces: Spaces, leading: tuple[Any, ...] = (...,)
+) -> tuple[int, ...]:
+    """The leading axes of all observations, after checks of names, dtypes and shapes. [NET-2] [NET-4] [NET-6] [NET-27]
+
+    leading: what these axes must be, in the notation of `require_shape`.
+
+    Raises:
+      ValueError: naming the key. Classes of a Discrete are not looked at: that would wait for an accelerator.
+    """
+    require_keys(name, observations, spaces.observations)
+    for key, space in spaces.observations.items():
+        x = observations[key]
+        require_shape(f"{name}[{key!r}]", x.shape, *leading, *space.array_shape)
+        leading = x.shape[: x.ndim - len(space.array_shape)]  # the first key's, for all others
+        if isinstance(space, Image):
+            require(x.dtype == torch.uint8, f"{name}[{key!r}]", "dtype uint8", x.dtype)
+        elif isinstance(space, Discrete):
+            whole = not x.is_floating_point() and x.dtype != torch.bool
+            require(whole, f"{name}[{key!r}]", "an integer dtype", x.dtype)
+    return leading

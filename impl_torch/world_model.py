@@ -21,19 +21,19 @@ from impl_torch.distributions import (
 )
 from impl_torch.layers import Params
 from impl_torch.networks import (
-    Observations,
     continue_head,
     decoder,
     encoder,
     feature,
-    require_observations,
     reward_head,
 )
 from impl_torch.rssm import core, observe, prepare, prior
 from impl_torch.shapes import (
+    Observations,
     compute_dtype,
     require,
     require_keys,
+    require_observations,
     require_same_shape,
     require_shape,
     wide_dtype,

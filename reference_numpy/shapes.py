@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spec.spaces import Discrete, Image, Spaces
+
 LISTED = 8  # problems that one message names
 
 
@@ -60,7 +62,7 @@ def require_keys(name: str, given: Iterable[str], expected: Iterable[str], exact
 def require_shapes(name: str, arrays: Mapping[str, Any], expected: Mapping[str, tuple[int, ...]]) -> None:
     """Raises ValueError unless the arrays have exactly these names and shapes. [CON-8]"""
     differing = [key for key in expected if key in arrays and np.shape(arrays[key]) != expected[key]]
-    wrong = [f"{key!r} has shape {list(np.shape(arrays[key]))}, expected {list(expected[key])}" for key in differing]
+    wrong = [f"{key!r}: expected shape {list(expected[key])}, got {list(np.shape(arrays[key]))}" for key in differing]
     _refuse(name, _differences(set(arrays), set(expected)) + wrong)
 
 
@@ -74,3 +76,29 @@ def _refuse(name: str, problems: list[str]) -> None:
     if problems:
         more = [f"{len(problems) - LISTED} more"] if len(problems) > LISTED else []
         raise ValueError(f"{name}: {'; '.join(problems[:LISTED] + more)}")
+
+
+def require_observations(
+    name: str, observations: Mapping[str, Any], spaces: Spaces, leading: tuple[Any, ...] = (...,)
+) -> tuple[int, ...]:
+    """The leading axes of all observations, after checks of names, dtypes and shapes.
+    Implements [NET-2], [NET-4], [NET-6], [NET-27].
+
+    Args:
+      name: what the message calls the mapping.
+      observations: key -> [..., *array_shape], raw; other keys are ignored.
+      leading: what the leading axes must be, in the notation of `require_shape`.
+
+    Raises:
+      ValueError: naming the key.
+    """
+    require_keys(name, observations, spaces.observations)
+    for key, space in spaces.observations.items():
+        x = np.asarray(observations[key])
+        require_shape(f"{name}[{key!r}]", x.shape, *leading, *space.array_shape)
+        leading = x.shape[: x.ndim - len(space.array_shape)]  # the first key's, for all others
+        if isinstance(space, Image):
+            require(x.dtype == np.uint8, f"{name}[{key!r}]", "dtype uint8", x.dtype)
+        elif isinstance(space, Discrete):
+            require(np.issubdtype(x.dtype, np.integer), f"{name}[{key!r}]", "an integer dtype", x.dtype)
+    return leading
