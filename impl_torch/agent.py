@@ -20,14 +20,7 @@ from impl_torch.behavior import (
 )
 from impl_torch.distributions import bernoulli_mean, symexp_twohot_mean
 from impl_torch.layers import Params, for_many_rows, truncated_normal
-from impl_torch.networks import (
-    actor,
-    continue_head,
-    critic,
-    encoder,
-    feature,
-    reward_head,
-)
+from impl_torch.networks import actor, continue_head, critic, encoder, feature, reward_head
 from impl_torch.optimizer import optimizer_step
 from impl_torch.returns import (
     cumulative_weights,

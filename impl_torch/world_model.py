@@ -20,13 +20,7 @@ from impl_torch.distributions import (
     unimix_probs,
 )
 from impl_torch.layers import Params
-from impl_torch.networks import (
-    continue_head,
-    decoder,
-    encoder,
-    feature,
-    reward_head,
-)
+from impl_torch.networks import continue_head, decoder, encoder, feature, reward_head
 from impl_torch.rssm import core, observe, prepare, prior
 from impl_torch.shapes import (
     Observations,
