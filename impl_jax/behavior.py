@@ -6,14 +6,13 @@ so that training can keep time first.
 
 import functools
 from collections.abc import Iterator, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jax.typing import ArrayLike
 
-from impl_jax.checks import require, require_same_shape, require_shape
 from impl_jax.distributions import (
     bounded_normal,
     categorical_entropy,
@@ -26,35 +25,33 @@ from impl_jax.distributions import (
     symexp_twohot_mean,
     unimix_log_probs,
 )
-from impl_jax.transforms import exponential_bins, real
+from impl_jax.shapes import require_keys, require_same_shape, require_shape, require_shapes, widen
+from impl_jax.transforms import exponential_bins
 from spec import Config, Discrete, Spaces
 
 Outputs = Mapping[str, Mapping[str, jax.Array]]
 
 
-def _check_outputs(outputs: Outputs, spaces: Spaces) -> tuple[int, ...]:
-    """The leading axes of the actor's outputs, after checking keys and shapes. [BEH-23]"""
-    require(
-        set(outputs) == set(spaces.actions), "outputs", f"the action keys {list(spaces.actions)}", f"{sorted(outputs)}"
-    )
-    leading: tuple[int, ...] | None = None
+def _require_outputs(outputs: Outputs, spaces: Spaces) -> tuple[int, ...]:
+    """The leading axes of the actor's outputs, after checks of keys and shapes. [BEH-23]"""
+    require_keys("outputs", outputs, spaces.actions, exactly=True)
+    leading: tuple[Any, ...] = (...,)
     for key, space in spaces.actions.items():
-        parts = ("logits",) if isinstance(space, Discrete) else ("mean", "std")
-        for part in parts:
-            require(part in outputs[key], f"outputs of {key!r}", f"the entry {part!r}", f"{sorted(outputs[key])}")
-            shape = outputs[key][part].shape
-            leading = shape[:-1] if leading is None else leading
-            require_shape(f"outputs of {key!r}, {part}", outputs[key][part], *leading, space.encoded_size)
-    assert leading is not None  # a task has at least one action
+        names = ("logits",) if isinstance(space, Discrete) else ("mean", "std")
+        require_keys(f"outputs[{key!r}]", outputs[key], names, exactly=True)
+        for name in names:
+            shape = outputs[key][name].shape
+            require_shape(f"outputs[{key!r}][{name!r}]", shape, *leading, space.encoded_size)
+            leading = shape[:-1]  # the first one's, for all others
     return leading
 
 
 class _Categorical(NamedTuple):
     """One entry of a Discrete. [BEH-2]"""
 
-    log_probs: jax.Array
+    log_probs: jax.Array  # [..., classes]
     length: int  # in the flat action
-    noise: int = 1
+    noise: int = 1  # length in the noise
 
     def sample(self, noise: jax.Array) -> jax.Array:
         return categorical_sample(self.log_probs, noise[..., 0])
@@ -72,8 +69,8 @@ class _Categorical(NamedTuple):
 class _Normals(NamedTuple):
     """All dimensions of a Vector. [BEH-4]"""
 
-    mean: jax.Array
-    std: jax.Array
+    mean: jax.Array  # [..., size]
+    std: jax.Array  # [..., size]
     length: int
     noise: int
 
@@ -101,15 +98,14 @@ def _distributions(outputs: Outputs, spaces: Spaces, config: Config) -> Iterator
                 start += classes
         else:
             mean, std = outputs[key]["mean"], outputs[key]["std"]
-            yield _Normals(
-                *bounded_normal(mean, std, config.actor_min_std, config.actor_max_std), space.size, space.size
-            )
+            mean, std = bounded_normal(mean, std, config.actor_min_std, config.actor_max_std)
+            yield _Normals(mean, std, space.size, space.size)
 
 
 def sample_action(outputs: Outputs, noise: jax.Array, spaces: Spaces, config: Config) -> jax.Array:
     """A flat action [..., A] from noise [..., K], neither clipped nor squashed, constant. [BEH-1] to [BEH-5]"""
-    leading = _check_outputs(outputs, spaces)
-    require_shape("noise", noise, *leading, spaces.action_noise_size)
+    leading = _require_outputs(outputs, spaces)
+    require_shape("noise", noise.shape, *leading, spaces.action_noise_size)
     actions, start = [], 0
     for part in _distributions(outputs, spaces, config):
         actions.append(part.sample(noise[..., start : start + part.noise]))
@@ -119,15 +115,14 @@ def sample_action(outputs: Outputs, noise: jax.Array, spaces: Spaces, config: Co
 
 def mode_action(outputs: Outputs, spaces: Spaces, config: Config) -> jax.Array:
     """The mode of the policy as a flat action [..., A], constant. [LOOP-71]"""
-    _check_outputs(outputs, spaces)
-    return jax.lax.stop_gradient(jnp.concatenate([part.mode() for part in _distributions(outputs, spaces, config)], -1))
+    _require_outputs(outputs, spaces)
+    return stop_gradient(jnp.concatenate([part.mode() for part in _distributions(outputs, spaces, config)], -1))
 
 
 def action_log_prob(outputs: Outputs, action: jax.Array, spaces: Spaces, config: Config) -> jax.Array:
-    """The log-probability of a raw flat action [..., A], a constant, summed over everything: [...], nats. [BEH-5],
-    [BEH-6]"""
-    leading = _check_outputs(outputs, spaces)
-    require_shape("action", action, *leading, spaces.action_size)
+    """Log-probability of a flat action [..., A], a constant, summed over its parts: [...], nats. [BEH-5], [BEH-6]"""
+    leading = _require_outputs(outputs, spaces)
+    require_shape("action", action.shape, *leading, spaces.action_size)
     total, start = [], 0
     for part in _distributions(outputs, spaces, config):
         total.append(part.log_prob(action[..., start : start + part.length]))
@@ -136,8 +131,8 @@ def action_log_prob(outputs: Outputs, action: jax.Array, spaces: Spaces, config:
 
 
 def action_entropy(outputs: Outputs, spaces: Spaces, config: Config) -> jax.Array:
-    """The entropy of the policy, summed over everything: [...], nats. [BEH-7]"""
-    _check_outputs(outputs, spaces)
+    """Entropy of the policy, summed over all its parts: [...], nats. [BEH-7]"""
+    _require_outputs(outputs, spaces)
     return functools.reduce(jnp.add, [part.entropy() for part in _distributions(outputs, spaces, config)])
 
 
@@ -150,40 +145,43 @@ def actor_loss(
     scale: ArrayLike,
     config: Config,
 ) -> jax.Array:
-    """Reinforce with a bonus for entropy, [N, H] each. Section "Actor learning". [BEH-9], [BEH-10]"""
+    """-weight * (advantage * log_prob + entropy_scale * entropy): [N, H] five times -> [N, H]. [BEH-9], [BEH-10]
+
+    Section "Actor learning".
+    """
     require_same_shape(log_prob=log_prob, entropy=entropy, returns=returns, value=value, weight=weight)
-    require_shape("scale", jnp.asarray(scale))
-    log_prob, entropy = real(log_prob), real(entropy)
-    advantage = stop_gradient((real(returns) - real(value)) / real(scale))
-    return -stop_gradient(real(weight)) * (advantage * log_prob + config.entropy_scale * entropy)
+    require_shape("scale", jnp.shape(scale))
+    log_prob, entropy = widen(log_prob), widen(entropy)
+    advantage = stop_gradient((widen(returns) - widen(value)) / widen(scale))
+    return -stop_gradient(widen(weight)) * (advantage * log_prob + config.entropy_scale * entropy)
 
 
 def _value_loss(logits: jax.Array, slow_logits: jax.Array, returns: jax.Array, config: Config) -> jax.Array:
-    """Cross-entropy with the return, and with the mean of the slow critic as a target of its own. Section "Critic
-    learning"."""
-    require_shape("logits", logits, *returns.shape, config.bins)
+    """Cross-entropy towards the return and towards the slow critic's mean. Section "Critic learning"."""
+    require_shape("logits", logits.shape, *returns.shape, config.bins)
     require_same_shape(logits=logits, slow_logits=slow_logits)
     bins = exponential_bins(config.bins)
     slow_mean = stop_gradient(symexp_twohot_mean(slow_logits, bins))
-    return symexp_twohot_loss(logits, returns, bins) + config.slow_critic_scale * symexp_twohot_loss(
-        logits, slow_mean, bins
-    )
+    towards_return = symexp_twohot_loss(logits, returns, bins)  # XLA finds that both losses take the same log-softmax
+    return towards_return + config.slow_critic_scale * symexp_twohot_loss(logits, slow_mean, bins)
 
 
 def critic_loss(
     logits: jax.Array, slow_logits: jax.Array, returns: jax.Array, weight: jax.Array, config: Config
 ) -> jax.Array:
     """The critic's loss in imagination: [N, H, bins] twice and [N, H] twice -> [N, H]. [BEH-12], [BEH-13]"""
-    require_same_shape(returns=returns, weight=weight)
-    return stop_gradient(real(weight)) * _value_loss(logits, slow_logits, returns, config)
+    require_same_shape(weight=weight, returns=returns)
+    return stop_gradient(widen(weight)) * _value_loss(logits, slow_logits, returns, config)
 
 
 def replay_critic_loss(
     logits: jax.Array, slow_logits: jax.Array, returns: jax.Array, is_last: jax.Array, config: Config
 ) -> jax.Array:
-    """The critic's loss on replayed steps 0 .. T-2: [B, T-1, bins] twice and [B, T-1] twice -> [B, T-1]. [BEH-14],
-    [BEH-15]"""
-    require_same_shape(returns=returns, is_last=is_last)
+    """The critic's loss on replayed steps 0 .. T-2, 0 where an episode ends. [BEH-14], [BEH-15]
+
+    [B, T-1, bins] twice and [B, T-1] twice -> [B, T-1].
+    """
+    require_same_shape(is_last=is_last, returns=returns)
     loss = _value_loss(logits, slow_logits, returns, config)
     return (1.0 - jnp.asarray(is_last).astype(loss.dtype)) * loss
 
@@ -196,10 +194,7 @@ def update_slow_critic(
     Raises:
       ValueError: names or shapes that differ.
     """
-    names = {name for name in critic if name.startswith("critic/")}
-    require(set(slow) == names, "slow", f"the names {sorted(names)}", f"{sorted(slow)}")
-    for name in slow:
-        require_shape(f"critic {name}", critic[name], *slow[name].shape)
+    require_shapes("slow", slow, {name: x.shape for name, x in critic.items() if name.startswith("critic/")})
     return {
         name: (decay * value + (1.0 - decay) * critic[name].astype(value.dtype)).astype(value.dtype)
         for name, value in slow.items()

@@ -13,9 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from impl_jax import agent, world_model
-from impl_jax.checks import require
-from impl_jax.layers import compute_dtype, exact_dtype
 from impl_jax.optimizer import norm
+from impl_jax.shapes import compute_dtype, require, require_keys, require_shapes, wide_dtype
 from spec import Config, Discrete, Spaces, parameter_table
 
 Arrays = Mapping[str, np.ndarray]
@@ -24,13 +23,15 @@ Arrays = Mapping[str, np.ndarray]
 class Learner:
     """An agent on one device.
 
+    Each of its methods is one compiled program, noise and metrics included: a call costs one launch, whatever the
+    number of parameters, and nothing but inputs and results crosses to the host.
+
     seed: of the initial parameters. device: see `select_device`. nonfinite: "stop" or "skip", [LOOP-40] to [LOOP-42].
     threads: that compute on the CPU, in the whole process; counts only before JAX has begun to use a device. None
     leaves them as they are.
 
     Raises:
-      ValueError: an unknown device, or one that this installation of JAX does not have, or another word for
-        `nonfinite`.
+      ValueError: a device that is unknown or not there, or another word for `nonfinite`.
     """
 
     def __init__(
@@ -48,9 +49,8 @@ class Learner:
             jax.config.update("jax_enable_x64", True)
         self.spaces, self.config, self._nonfinite = spaces, config, nonfinite
         if threads:
-            os.environ["NPROC"] = str(
-                threads
-            )  # XLA has no other way to say it; it looks when it makes the client of the CPU.
+            # XLA has no other way to say it, and looks when it makes the client of the CPU.
+            os.environ["NPROC"] = str(threads)
         self._device = select_device(device)
         self.device = ":".join([self._device.platform, *(device or "").split(":")[1:]])
         with jax.default_device(self._device):
@@ -58,26 +58,18 @@ class Learner:
         self._state = jax.device_put(state, self._device)
         self._stopped = self._flag(False)  # on the device: no train step waits for the one before
         self._policy = jax.jit(self._policy_function, static_argnames="mode")
-        self._train = jax.jit(self._train_function, donate_argnums=0)
+        self._train = jax.jit(self._train_function, donate_argnums=0)  # the new state takes the memory of the old one
         self._gradients = jax.jit(self._gradients_function)
         self._predict = jax.jit(self._predict_function, static_argnums=4)
-        self._batch_keys = (
-            *spaces.observations,
-            "reward",
-            "is_first",
-            "is_last",
-            "is_terminal",
-            "prev_action",
-            "deter",
-            "stoch",
-        )
+        flags = ("reward", "is_first", "is_last", "is_terminal")
+        self._batch_keys = (*spaces.observations, *flags, "prev_action", "deter", "stoch")
 
     def initial_carry(self, envs: int) -> Any:
         """The carry of `envs` environments before their first step. [CON-5]"""
         dtype, config = compute_dtype(self.config), self.config
         shapes = {"deter": (envs, config.deter), "stoch": (envs, config.stoch, config.classes)}
         carry = {key: jnp.zeros(shape, dtype) for key, shape in shapes.items()}
-        carry["action"] = jnp.zeros((envs, self.spaces.action_size), exact_dtype(config))
+        carry["action"] = jnp.zeros((envs, self.spaces.action_size), wide_dtype(config))
         return jax.device_put(carry, self._device)
 
     def save_carry(self, carry: Any) -> dict[str, np.ndarray]:
@@ -90,9 +82,8 @@ class Learner:
     def load_carry(self, arrays: Arrays) -> Any:
         """The inverse of `save_carry`. [CON-5]"""
         zeros = self.initial_carry(len(arrays["action"]))
-        return jax.device_put(
-            {key: jnp.asarray(arrays[key], value.dtype) for key, value in zeros.items()}, self._device
-        )
+        carry = {key: jnp.asarray(arrays[key], value.dtype) for key, value in zeros.items()}
+        return jax.device_put(carry, self._device)
 
     def memory(self) -> int | None:
         """Bytes in use on the accelerator; None without one."""
@@ -125,8 +116,7 @@ class Learner:
         return {name: _Element(metrics.values, index) for index, name in enumerate(metrics.names)}, latents
 
     def gradients(self, batch: Arrays, seed: int) -> tuple[dict[str, float], dict[str, np.ndarray]]:
-        """The metrics and the gradient of every parameter that a train step would compute now. Changes nothing.
-        [LOOP-44]"""
+        """Metrics and gradients by name, as a train step would compute them now. Changes nothing. [LOOP-44]"""
         metrics, gradients = self._gradients(self._state, self._inputs(batch), np.uint32(seed))
         numbers = dict(zip(metrics.names, np.asarray(metrics.values).tolist(), strict=True))
         return numbers, {name: np.array(gradient) for name, gradient in gradients.items()}
@@ -134,14 +124,13 @@ class Learner:
     def predict(
         self, observation: Arrays, prev_action: np.ndarray, is_first: np.ndarray, context: int, seed: int
     ) -> dict[str, np.ndarray]:
-        """The open-loop prediction of recorded sequences, with the random numbers of a seed. [WM-20] to [WM-24]
+        """The open-loop prediction of recorded sequences, with the noise of a seed. [WM-20] to [WM-24]
 
-        observation: key -> [B, T, ...]; prev_action [B, T, A]; is_first [B, T].
+        observation {key: [B, T, ...]}, prev_action [B, T, A], is_first [B, T].
         """
-        inputs = {key: np.asarray(observation[key]) for key in self.spaces.observations if key in observation}
-        inputs, prev_action, is_first = jax.device_put(
-            (inputs, np.asarray(prev_action), np.asarray(is_first, bool)), self._device
-        )
+        observed = {key: np.asarray(observation[key]) for key in self.spaces.observations if key in observation}
+        arrays = (observed, np.asarray(prev_action), np.asarray(is_first, bool))
+        inputs, prev_action, is_first = jax.device_put(arrays, self._device)
         predictions = self._predict(self._state["params"], inputs, prev_action, is_first, context, np.uint32(seed))
         return {key: np.asarray(value) for key, value in predictions.items()}
 
@@ -154,21 +143,10 @@ class Learner:
         """Takes over a training state. [AGT-10]
 
         Raises:
-          ValueError: a missing or unexpected name, or a wrong shape; the message lists them.
+          ValueError: a missing or unknown name, or a wrong shape; nothing is changed then.
         """
         current = _flatten(self._state)
-        shapes = {name: value.shape for name, value in current.items()}
-        problems = [f"missing: {name}" for name in shapes if name not in state]
-        problems += [f"unexpected: {name}" for name in state if name not in shapes]
-        problems += [
-            f"wrong shape: {name} is {list(np.shape(state[name]))}, expected {list(shape)}"
-            for name, shape in shapes.items()
-            if name in state and np.shape(state[name]) != shape
-        ]
-        if problems:
-            raise ValueError(
-                "this training state does not fit the configuration and spaces:\n  " + "\n  ".join(problems)
-            )
+        require_shapes("training state", state, {name: value.shape for name, value in current.items()})
         # Copies, because the next train step reuses the memory of the state.
         new = {name: np.array(state[name], value.dtype) for name, value in current.items()}
         self._state = jax.device_put(_unflatten(new), self._device)
@@ -178,9 +156,7 @@ class Learner:
         return jax.device_put(np.asarray(value), self._device)
 
     def _inputs(self, batch: Arrays) -> dict[str, jax.Array]:
-        missing = [key for key in self._batch_keys if key not in batch]
-        if missing:
-            raise ValueError(f"the train batch lacks {', '.join(missing)}; it has {', '.join(sorted(batch))}")
+        require_keys("batch", batch, self._batch_keys)
         return jax.device_put({key: batch[key] for key in self._batch_keys}, self._device)
 
     def _policy_function(
@@ -199,6 +175,7 @@ class Learner:
     ) -> tuple[Any, jax.Array, Any, Any]:
         new, aux = agent.train_step(state, batch, self._train_noise(batch, seed), self.spaces, self.config)
         metrics = {f"loss/{name}": mean for name, mean in aux["losses"].items()} | aux["metrics"]
+        # Chosen on the device, so that the host waits for no train step before it starts the next.
         finite = jnp.isfinite(metrics["loss/total"]) & jnp.isfinite(metrics["gradient_norm"])
         applied = finite & ~stopped
         state = jax.tree.map(lambda after, before: jnp.where(applied, after, before), new, state)
@@ -218,16 +195,15 @@ class Learner:
         return self._packed(metrics), gradients
 
     def _train_noise(self, batch: Any, seed: jax.Array) -> dict[str, jax.Array]:
-        """[CON-20]"""
+        """All random numbers of a step, drawn before its loops, which draw none. [CON-20]"""
         B, T = batch["is_first"].shape
         N, H, S = B * T, self.config.imagination_horizon, self.config.stoch
         uniforms = {"posterior": (B, T, S), "prior": (N, H, S)}
         return _noise(seed, uniforms, (N, H), self.spaces, self.config)
 
     def _packed(self, metrics: Mapping[str, jax.Array]) -> "_Metrics":
-        return _Metrics(
-            tuple(metrics), jnp.stack([value.astype(exact_dtype(self.config)) for value in metrics.values()])
-        )
+        dtype = wide_dtype(self.config)
+        return _Metrics(tuple(metrics), jnp.stack([value.astype(dtype) for value in metrics.values()]))
 
     def _predict_function(
         self, params: Any, observation: Any, prev_action: jax.Array, is_first: jax.Array, context: int, seed: jax.Array
@@ -237,7 +213,7 @@ class Learner:
             "posterior": (B, max(0, context), self.config.stoch),
             "prior": (B, max(0, T - context), self.config.stoch),
         }
-        dtype = exact_dtype(self.config)
+        dtype = wide_dtype(self.config)
         noise = {
             name: jax.random.uniform(jax.random.fold_in(key, i), shape, dtype)
             for i, (name, shape) in enumerate(shapes.items())
@@ -311,7 +287,7 @@ def _initial_state(seed: jax.Array, static: _Static) -> dict[str, Any]:
     kernels = {name: entry.shape for name, entry in table.items() if entry.initializer == "truncated_normal"}
     # One draw for all kernels, cut up: every draw of its own would be compiled by itself.
     ends = np.cumsum([math.prod(shape) for shape in kernels.values()])
-    numbers = jax.random.uniform(jax.random.key(seed), (int(ends[-1]),), exact_dtype(static.config))
+    numbers = jax.random.uniform(jax.random.key(seed), (int(ends[-1]),), wide_dtype(static.config))
     pieces = zip(kernels.items(), jnp.split(numbers, ends[:-1]), strict=True)
     uniforms = {name: piece.reshape(shape) for (name, shape), piece in pieces}
     return agent.initial_state(agent.initial_parameters(table, uniforms))
@@ -320,9 +296,11 @@ def _initial_state(seed: jax.Array, static: _Static) -> dict[str, Any]:
 def _noise(
     seed: jax.Array, uniforms: Mapping[str, tuple[int, ...]], leading: tuple[int, ...], spaces: Spaces, config: Config
 ) -> dict[str, jax.Array]:
-    """Uniforms of the given shapes, and "action" [*leading, K]: normals for vectors, uniforms for categoricals.
-    [CON-19] to [CON-21]"""
-    key, dtype = jax.random.key(seed), exact_dtype(config)
+    """Uniforms of the given shapes, and "action" [*leading, K]: normals for a Vector, uniforms for a Discrete.
+
+    Every array has a key of its own, counted from the seed's. [CON-19] to [CON-21]
+    """
+    key, dtype = jax.random.key(seed), wide_dtype(config)
     noise = {
         name: jax.random.uniform(jax.random.fold_in(key, i), shape, dtype)
         for i, (name, shape) in enumerate(uniforms.items())

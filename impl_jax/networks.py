@@ -3,80 +3,54 @@
 They return raw outputs, those of the decoder and the heads in float32 or better. [NET-26]
 """
 
-from collections.abc import Mapping
-
 import jax
 import jax.numpy as jnp
 
-from impl_jax.checks import require, require_shape, require_trailing
 from impl_jax.layers import (
     Params,
     activate,
     block_linear,
-    compute_dtype,
     convolution,
     dense,
-    exact_dtype,
     linear,
     max_pool,
     mlp,
     transposed_convolution,
     upsampled_convolution,
 )
+from impl_jax.shapes import Observations, compute_dtype, require_observations, require_shape, wide_dtype
 from impl_jax.transforms import symlog
-from spec import Config, Discrete, Image, Spaces, Vector
+from spec import Config, Discrete, Spaces, Vector
 from spec.parameters import bottleneck
-
-Observations = Mapping[str, jax.Array]
 
 
 def feature(deter: jax.Array, stoch: jax.Array) -> jax.Array:
     """The model state that all heads read: [..., D], [..., S, C] -> [..., D + S*C]. [NET-1], [CON-4]"""
-    require_shape("stoch", stoch, *deter.shape[:-1], "S", "C")
+    require_shape("stoch", stoch.shape, *deter.shape[:-1], "S", "C")
     return jnp.concatenate([deter, stoch.reshape(*stoch.shape[:-2], -1).astype(deter.dtype)], -1)
 
 
 def encoder(params: Params, observations: Observations, spaces: Spaces, config: Config) -> jax.Array:
-    """Raw observations [..., *array_shape] -> tokens [..., E]: vector features, then flat image features. [NET-2] to
-    [NET-12]
+    """Raw observations {key: [..., *array_shape]} -> tokens [..., E]: those of vectors, then of images.
+
+    [NET-2] to [NET-12]
 
     Raises:
       ValueError: a missing key, or an observation of the wrong shape or dtype. [NET-27]
     """
-    leading = _leading_axes(observations, spaces)
+    leading = require_observations("observations", observations, spaces)
     if spaces.images:
         bottleneck(config, spaces)  # refuses sides that cannot be halved, before any network runs
     tokens = []
     if spaces.vectors:
-        x = jnp.concatenate(
-            [_vector_input(observations[key], space, config) for key, space in spaces.vectors.items()], -1
-        )
-        tokens.append(
-            mlp(params, "encoder/vector", x.astype(compute_dtype(config)), config.encoder_layers, config.norm_epsilon)
-        )
+        vectors = [_vector_input(observations[key], space, config) for key, space in spaces.vectors.items()]
+        x = jnp.concatenate(vectors, -1).astype(compute_dtype(config))  # [..., sum of encoded sizes]
+        tokens.append(mlp(params, "encoder/vector", x, config.encoder_layers, config.norm_epsilon))  # [..., d]
     if spaces.images:
-        x = jnp.concatenate([observations[key] for key in spaces.images], -1).astype(exact_dtype(config))
-        x = (x / 255.0 - 0.5).astype(compute_dtype(config))
-        tokens.append(_image_encoder(params, x, config).reshape(*leading, -1))
+        x = jnp.concatenate([observations[key] for key in spaces.images], -1).astype(wide_dtype(config))
+        x = (x / 255.0 - 0.5).astype(compute_dtype(config))  # [..., H, W, channels]; rounded once, here
+        tokens.append(_image_encoder(params, x, config).reshape(*leading, -1))  # [..., h0*w0*c0]
     return jnp.concatenate(tokens, -1)
-
-
-def _leading_axes(observations: Observations, spaces: Spaces) -> tuple[int, ...]:
-    """The leading axes that all observations share, after checking them. [NET-2], [NET-4], [NET-6], [NET-27]"""
-    leading: tuple[int, ...] | None = None
-    for key, space in spaces.observations.items():
-        require(key in observations, "observations", f"the key {key!r}", f"the keys {sorted(observations)}")
-        x = observations[key]
-        if isinstance(space, Image):
-            require(x.dtype == jnp.uint8, f"observation {key!r}", "dtype uint8", x.dtype)
-        elif isinstance(space, Discrete):
-            require(jnp.issubdtype(x.dtype, jnp.integer), f"observation {key!r}", "an integer dtype", x.dtype)
-        require_trailing(f"observation {key!r}", x, *space.array_shape)
-        if leading is None:
-            leading = x.shape[: x.ndim - len(space.array_shape)]
-        require_shape(f"observation {key!r}", x, *leading, *space.array_shape)
-    assert leading is not None  # a task has at least one observation
-    return leading
 
 
 def onehots(x: jax.Array, space: Discrete, dtype: jnp.dtype) -> jax.Array:
@@ -88,7 +62,7 @@ def onehots(x: jax.Array, space: Discrete, dtype: jnp.dtype) -> jax.Array:
 
 def _vector_input(x: jax.Array, space: Vector | Discrete, config: Config) -> jax.Array:
     """What the encoder reads of one observation that is not an image. [NET-3], [CON-24]"""
-    dtype = exact_dtype(config)
+    dtype = wide_dtype(config)
     return onehots(x, space, dtype) if isinstance(space, Discrete) else symlog(x.astype(dtype))
 
 
@@ -104,13 +78,12 @@ def _image_encoder(params: Params, x: jax.Array, config: Config) -> jax.Array:
             x = convolution(x, kernel, bias, 2)
         else:
             x = max_pool(convolution(x, kernel, bias, 1))
-        x = activate(x, scale, config.norm_epsilon)
+        x = activate(x, scale, config.norm_epsilon)  # [n, h, w, c]
     return x
 
 
 def decoder(params: Params, feature: jax.Array, spaces: Spaces, config: Config) -> dict[str, jax.Array]:
-    """Reconstructions from features [..., F]: key -> symlog vectors, logits, or images in [0, 1]. [NET-13] to
-    [NET-19]"""
+    """Features [..., F] -> key -> vectors in symlog space, logits, or images in [0, 1]. [NET-13] to [NET-19]"""
     x = _feature_input(feature, config)
     result: dict[str, jax.Array] = {}
     if spaces.vectors:
@@ -128,39 +101,36 @@ def decoder(params: Params, feature: jax.Array, spaces: Spaces, config: Config) 
 
 def _image_decoder(params: Params, x: jax.Array, spaces: Spaces, config: Config) -> jax.Array:
     """Features [n, F] -> [n, H, W, image channels] in [0, 1]. [NET-15] to [NET-18]"""
-    height, width, _ = bottleneck(config, spaces)
+    height, width, channels = bottleneck(config, spaces)
     deter, stoch = x[:, : config.deter], x[:, config.deter :]
 
     from_deter = block_linear(deter, params["decoder/image/deter/kernel"], params["decoder/image/deter/bias"])
-    from_deter = from_deter.reshape(
-        -1, config.blocks, height, width, from_deter.shape[-1] // (config.blocks * height * width)
-    )
-    from_deter = from_deter.transpose(0, 2, 3, 1, 4).reshape(-1, height, width, config.blocks * from_deter.shape[-1])
+    from_deter = from_deter.reshape(-1, config.blocks, height, width, channels // config.blocks)  # [n, G, h0, w0, c0/G]
+    # Each block has its own channels: [n, h0, w0, c0].
+    from_deter = from_deter.transpose(0, 2, 3, 1, 4).reshape(-1, height, width, channels)
     hidden = dense(params, "decoder/image/stoch_hidden", stoch, config.norm_epsilon)
-    from_stoch = linear(hidden, params["decoder/image/stoch/kernel"], params["decoder/image/stoch/bias"]).reshape(
-        from_deter.shape
-    )
-    y = activate(from_deter + from_stoch, params["decoder/image/stem/scale"], config.norm_epsilon)
+    from_stoch = linear(hidden, params["decoder/image/stoch/kernel"], params["decoder/image/stoch/bias"])
+    y = from_deter + from_stoch.reshape(from_deter.shape)
+    y = activate(y, params["decoder/image/stem/scale"], config.norm_epsilon)
 
     double = transposed_convolution if config.cnn_sampling == "strided" else upsampled_convolution
     for index in range(len(config.cnn_multipliers) - 1):
         name = f"decoder/image/conv{index}"
-        y = activate(
-            double(y, params[f"{name}/kernel"], params[f"{name}/bias"]), params[f"{name}/scale"], config.norm_epsilon
-        )
+        y = double(y, params[f"{name}/kernel"], params[f"{name}/bias"])
+        y = activate(y, params[f"{name}/scale"], config.norm_epsilon)
     kernel, bias = params["decoder/image/out/kernel"], params["decoder/image/out/bias"]
     y = convolution(y, kernel, bias, 1) if config.cnn_outer else double(y, kernel, bias)
-    return jax.nn.sigmoid(y.astype(exact_dtype(config)))
+    return jax.nn.sigmoid(y.astype(wide_dtype(config)))
 
 
 def _feature_input(feature: jax.Array, config: Config) -> jax.Array:
-    require_trailing("feature", feature, config.feature_size)
+    require_shape("feature", feature.shape, ..., config.feature_size)
     return feature.astype(compute_dtype(config))
 
 
 def _output(params: Params, name: str, x: jax.Array, config: Config) -> jax.Array:
     """A last linear layer, in float32 or better. [NET-26]"""
-    return linear(x, params[f"{name}/kernel"], params[f"{name}/bias"]).astype(exact_dtype(config))
+    return linear(x, params[f"{name}/kernel"], params[f"{name}/bias"]).astype(wide_dtype(config))
 
 
 def _head(params: Params, name: str, feature: jax.Array, layers: int, config: Config) -> jax.Array:
@@ -169,7 +139,7 @@ def _head(params: Params, name: str, feature: jax.Array, layers: int, config: Co
 
 
 def reward_head(params: Params, feature: jax.Array, config: Config) -> jax.Array:
-    """Features [..., F] -> logits [..., bins] of the symexp-twohot reward. [NET-20]"""
+    """Features [..., F] -> logits [..., bins] of the reward. [NET-20]"""
     return _head(params, "reward", feature, config.reward_layers, config)
 
 
@@ -179,8 +149,7 @@ def continue_head(params: Params, feature: jax.Array, config: Config) -> jax.Arr
 
 
 def critic(params: Params, feature: jax.Array, config: Config) -> jax.Array:
-    """Features [..., F] -> logits [..., bins] of the symexp-twohot value; also with the slow critic's parameters.
-    [NET-20], [NET-23]"""
+    """Features [..., F] -> logits [..., bins] of the value, also by the slow critic's parameters. [NET-20], [NET-23]"""
     return _head(params, "critic", feature, config.critic_layers, config)
 
 

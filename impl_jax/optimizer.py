@@ -4,6 +4,9 @@ The plain functions of the chapter work on one tensor. `adaptive_gradient_clippi
 as ordinary optax transformations over any tree of parameters, for use on their own:
 
     optax.chain(adaptive_gradient_clipping(0.3), scale_by_laprop(), optax.scale_by_learning_rate(4e-5))
+
+One tensor at a time is no loss here: all of a train step is one program, in which XLA fuses what each tensor goes
+through.
 """
 
 import math
@@ -15,9 +18,7 @@ import jax.numpy as jnp
 import optax
 from jax.typing import ArrayLike
 
-from impl_jax.checks import require, require_same_shape
-from impl_jax.layers import exact_dtype
-from impl_jax.transforms import real
+from impl_jax.shapes import require, require_same_shape, require_shapes, wide_dtype, widen
 from spec import Config
 
 Arrays = Mapping[str, jax.Array]
@@ -26,9 +27,8 @@ _DEAD_ZONE = 1e-16  # gradients below it count as zero: their squares would leav
 
 
 def norm(x: ArrayLike) -> jax.Array:
-    """The root of the sum of squares over all entries, which neither overflows nor vanishes because the squares do.
-    [OPT-3]"""
-    x = real(x)
+    """The root of the sum of squares, taken of x / max|x|, so that squares neither overflow nor vanish. [OPT-3]"""
+    x = widen(x)
     peak = jnp.max(jnp.abs(x))
     return peak * jnp.sqrt(jnp.sum(jnp.square(x / jnp.where(peak == 0, 1.0, peak))))
 
@@ -43,10 +43,9 @@ def _clip_factor(gradient: jax.Array, parameter: jax.Array, clip: float, epsilon
 
 
 def adaptive_gradient_clip(gradient: ArrayLike, parameter: ArrayLike, clip: float, epsilon: float) -> jax.Array:
-    """The gradient, not longer than clip * max(epsilon, norm of its parameter): [...], [...] -> [...]. [OPT-1] to
-    [OPT-5]"""
-    gradient, parameter = real(gradient), real(parameter)
-    require_same_shape(gradient=gradient, parameter=parameter)
+    """The gradient, no longer than clip * max(epsilon, norm(parameter)); any shape. [OPT-1] to [OPT-5]"""
+    gradient, parameter = widen(gradient), widen(parameter)  # [OPT-19]
+    require_same_shape(parameter=parameter, gradient=gradient)
     return gradient * _clip_factor(gradient, parameter, clip, epsilon)[0]
 
 
@@ -57,7 +56,7 @@ def learning_rate(step: ArrayLike, config: Config) -> Any:
     if isinstance(step, int):
         return config.learning_rate * min(1.0, step / config.warmup_steps)
     slope = config.learning_rate / config.warmup_steps  # formed in float64 [OPT-19]
-    return jnp.minimum(jnp.asarray(step).astype(exact_dtype(config)) * slope, config.learning_rate)
+    return jnp.minimum(jnp.asarray(step).astype(wide_dtype(config)) * slope, config.learning_rate)
 
 
 def _correction(beta: float, step: ArrayLike, dtype: jnp.dtype) -> jax.Array:
@@ -67,10 +66,10 @@ def _correction(beta: float, step: ArrayLike, dtype: jnp.dtype) -> jax.Array:
     return -jnp.expm1((jnp.asarray(step).astype(dtype) + 1.0) * math.log(beta))
 
 
-def _check_betas(beta1: float, beta2: float) -> None:
-    """[OPT-14]"""
+def _require_betas(beta1: float, beta2: float) -> None:
+    """At 1 the bias correction would be 0/0. [OPT-14]"""
     for name, beta in (("beta1", beta1), ("beta2", beta2)):
-        require(0 <= beta < 1, name, "at least 0 and below 1: at 1 the bias correction would be 0/0", beta)
+        require(0 <= beta < 1, name, "at least 0 and below 1", beta)
 
 
 def _laprop(
@@ -82,10 +81,16 @@ def _laprop(
     beta2: float,
     epsilon: float,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    _check_betas(beta1, beta2)
+    """(update, second moment, momentum) of one tensor in float32 or better: all that `laprop` does but its checks.
+
+    v = beta2 v + (1 - beta2) g²,  m = beta1 m + (1 - beta1) g / (sqrt(v / c2) + epsilon),  update = m / c1, where c is
+    1 - beta^(step + 1).
+    """
+    _require_betas(beta1, beta2)
     gradient = jnp.where(jnp.abs(gradient) < _DEAD_ZONE, 0.0, gradient)
     second_moment = beta2 * second_moment + (1.0 - beta2) * jnp.square(gradient)
     root = jnp.sqrt(second_moment / _correction(beta2, step, gradient.dtype)) + epsilon
+    # Where the gradient is 0 its share is 0, not 0/0: [OPT-10].
     normalized = jnp.where(gradient == 0, 0.0, gradient / root)
     momentum = beta1 * momentum + (1.0 - beta1) * normalized
     return momentum / _correction(beta1, step, gradient.dtype), second_moment, momentum
@@ -94,13 +99,12 @@ def _laprop(
 def laprop(
     gradient: ArrayLike, second_moment: ArrayLike, momentum: ArrayLike, step: ArrayLike, config: Config
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """(update, second moment, momentum) of one tensor; the update without learning rate and minus sign. [OPT-8] to
-    [OPT-14]
+    """(update, new second moment, new momentum), without learning rate and sign; any shape. [OPT-8] to [OPT-14]
 
     Raises:
       ValueError: a beta of 1, or shapes that differ.
     """
-    gradient = real(gradient)
+    gradient = widen(gradient)
     second_moment, momentum = (jnp.asarray(x).astype(gradient.dtype) for x in (second_moment, momentum))
     require_same_shape(gradient=gradient, second_moment=second_moment, momentum=momentum)
     return _laprop(gradient, second_moment, momentum, step, config.beta1, config.beta2, config.laprop_epsilon)
@@ -109,8 +113,9 @@ def laprop(
 def optimizer_step(
     params: Arrays, gradients: Arrays, state: Mapping[str, Any], config: Config
 ) -> tuple[dict[str, jax.Array], dict[str, Any]]:
-    """One update of every tensor: (params, state), the state being {"step", "second_moment", "momentum"}. [OPT-15] to
-    [OPT-20]
+    """Clips, normalizes and steps every tensor; returns new params and a new state. [OPT-15] to [OPT-20]
+
+    state: {"step": int, "second_moment": name -> array, "momentum": name -> array}.
 
     Raises:
       ValueError: names or shapes that differ.
@@ -123,16 +128,17 @@ def optimizer_step_with_metrics(
     params: Arrays, gradients: Arrays, state: Mapping[str, Any], config: Config
 ) -> tuple[dict[str, jax.Array], dict[str, Any], dict[str, jax.Array]]:
     """`optimizer_step`, and the norms of the whole gradient and update and the share of tensors that were clipped."""
-    _check_names(params, gradients, state)
+    shapes = {name: x.shape for name, x in params.items()}
+    moments = {"second_moment": state["second_moment"], "momentum": state["momentum"]}
+    for what, tree in {"gradients": gradients, **moments}.items():
+        require_shapes(what, tree, shapes)  # [OPT-18]
     step, rate = state["step"], learning_rate(state["step"], config)
     new: dict[str, dict[str, jax.Array]] = {"params": {}, "second_moment": {}, "momentum": {}}
     lengths, moves, factors = [], [], []
     for name, parameter in params.items():
         factor, length = _clip_factor(gradients[name], parameter, config.agc_clip, config.agc_epsilon)
-        moments = state["second_moment"][name], state["momentum"][name]
-        update, new["second_moment"][name], new["momentum"][name] = laprop(
-            gradients[name] * factor, *moments, step, config
-        )
+        old = state["second_moment"][name], state["momentum"][name]
+        update, new["second_moment"][name], new["momentum"][name] = laprop(gradients[name] * factor, *old, step, config)
         new["params"][name] = parameter - rate * update
         lengths.append(length)
         moves.append(jnp.sum(jnp.square(update)))
@@ -142,24 +148,7 @@ def optimizer_step_with_metrics(
         "update_norm": jnp.sqrt(jnp.sum(jnp.stack(moves))) * rate,
         "clip_fraction": jnp.mean((jnp.stack(factors) < 1).astype(jnp.float32)),
     }
-    return (
-        new["params"],
-        {"step": step + 1, "second_moment": new["second_moment"], "momentum": new["momentum"]},
-        metrics,
-    )
-
-
-def _check_names(params: Arrays, gradients: Arrays, state: Mapping[str, Any]) -> None:
-    """[OPT-18]"""
-    for kind, arrays in (
-        ("gradients", gradients),
-        ("second_moment", state["second_moment"]),
-        ("momentum", state["momentum"]),
-    ):
-        different = sorted(set(params) ^ set(arrays))
-        require(not different, kind, "the names of the parameters", f"a difference in {different}")
-        for name, parameter in params.items():
-            require_same_shape(**{f"parameter {name}": parameter, f"{kind} {name}": arrays[name]})
+    return new.pop("params"), {"step": step + 1, **new}, metrics
 
 
 def initial_optimizer_state(params: Arrays) -> dict[str, Any]:
@@ -181,9 +170,11 @@ def adaptive_gradient_clipping(clip: float, epsilon: float = 1e-3) -> optax.Grad
         updates: optax.Updates, state: optax.OptState, params: optax.Params | None = None
     ) -> tuple[optax.Updates, optax.OptState]:
         require(params is not None, "params", "the parameters, to compare the gradients with", None)
-        return jax.tree.map(
-            lambda g, p: adaptive_gradient_clip(g, p, clip, epsilon).astype(g.dtype), updates, params
-        ), state
+
+        def clipped(gradient: jax.Array, parameter: jax.Array) -> jax.Array:
+            return adaptive_gradient_clip(gradient, parameter, clip, epsilon).astype(gradient.dtype)
+
+        return jax.tree.map(clipped, updates, params), state
 
     return optax.GradientTransformation(lambda params: optax.EmptyState(), update)
 
@@ -202,7 +193,7 @@ def scale_by_laprop(beta1: float = 0.9, beta2: float = 0.99, epsilon: float = 1e
     Raises:
       ValueError: a beta outside [0, 1).
     """
-    _check_betas(beta1, beta2)
+    _require_betas(beta1, beta2)
 
     def init(params: optax.Params) -> LaPropState:
         def zeros() -> optax.Updates:
@@ -213,7 +204,7 @@ def scale_by_laprop(beta1: float = 0.9, beta2: float = 0.99, epsilon: float = 1e
     def update(
         updates: optax.Updates, state: LaPropState, params: optax.Params | None = None
     ) -> tuple[optax.Updates, LaPropState]:
-        gradients = jax.tree.map(real, updates)
+        gradients = jax.tree.map(widen, updates)
         results = jax.tree.map(
             lambda g, v, m: _laprop(g, v, m, state.step, beta1, beta2, epsilon),
             gradients,

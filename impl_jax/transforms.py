@@ -1,35 +1,29 @@
-"""Numbers of any size: symlog, symexp, the bins, twohot weights and the ordered expectation. Chapter:
-spec/01-transforms.md."""
+"""Numbers of any size: symlog, symexp, bins, twohot weights, ordered expectation. Chapter: spec/01-transforms.md."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from impl_jax.checks import require
-
-
-def real(x: ArrayLike) -> jax.Array:
-    """x in float32 or float64: everything but float64 is converted to float32. [TRA-1], [DIS-1]"""
-    array = jnp.asarray(x)
-    return array if array.dtype == jnp.float64 else array.astype(jnp.float32)
+from impl_jax.shapes import require, require_shape, widen
 
 
 def symlog(x: ArrayLike) -> jax.Array:
     """sign(x) ln(1 + |x|), elementwise. Section "Robust predictions". [TRA-3]"""
-    x = real(x)
+    x = widen(x)
     return jnp.sign(x) * jnp.log1p(jnp.abs(x))
 
 
 def symexp(x: ArrayLike) -> jax.Array:
     """sign(x) (e^|x| - 1), elementwise: the inverse of `symlog`. [TRA-4]"""
-    x = real(x)
+    x = widen(x)
     return jnp.sign(x) * jnp.expm1(jnp.abs(x))
 
 
 def exponential_bins(bins: int) -> np.ndarray:
-    """The positions of the twohot distributions: [bins], NumPy float64, antisymmetric, from -symexp(20) to symexp(20).
-    [TRA-5], [TRA-6]
+    """Positions [bins] in NumPy float64: symexp of even steps from -20 to 20, exactly antisymmetric. [TRA-5], [TRA-6]
+
+    NumPy's, so that they are a constant of the compiled program and not computed by it.
 
     Raises:
       ValueError: an even number of bins, or less than three.
@@ -41,45 +35,41 @@ def exponential_bins(bins: int) -> np.ndarray:
 
 
 def twohot(x: ArrayLike, bins: ArrayLike) -> jax.Array:
-    """Weights of the two bins around each number, interpolated between the bins themselves: [...] -> [..., K]. [TRA-7]
-    to [TRA-9]
+    """Weights of the two bins around each number, interpolated between them: [...] -> [..., K]. [TRA-7] to [TRA-9]
+
+    Dense, with comparisons in place of a search and a scatter: XLA fuses comparisons with what reads the weights, and
+    would write out what a scatter makes.
 
     Raises:
       ValueError: bins that are not a vector of at least two. [TRA-13]
     """
-    x, bins = real(x), jnp.asarray(bins)
-    require(
-        bins.ndim == 1 and bins.shape[0] >= 2, "bins", "a vector of at least 2 numbers", f"shape {list(bins.shape)}"
-    )
+    x, bins = widen(x), jnp.asarray(bins)
+    require_shape("bins", bins.shape, "K")
+    require(len(bins) >= 2, "bins", "at least 2 bins", len(bins))
     bins = jax.lax.stop_gradient(bins.astype(x.dtype))
-    x = jnp.clip(x, bins[0], bins[-1])[..., None]
-    # The top bin gets a width too, so that a number at the upper end has weight exactly 1 by the same formula as at any
-    # other bin.
-    widths = jnp.append(jnp.diff(bins), jnp.ones((), x.dtype))
-    lower = jnp.maximum(jnp.sum(bins <= x, axis=-1, keepdims=True) - 1, 0)
-    share = jnp.minimum((x - bins[lower]) / widths[lower], 1.0)
+    x = jnp.clip(x, bins[0], bins[-1])[..., None]  # [..., 1]
+    # The top bin gets a width too: a number at the upper end then has weight exactly 1 by the formula of any other bin.
+    widths = jnp.append(jnp.diff(bins), jnp.ones((), x.dtype))  # [K]
+    lower = jnp.maximum(jnp.sum(bins <= x, axis=-1, keepdims=True) - 1, 0)  # [..., 1]
+    share = jnp.minimum((x - bins[lower]) / widths[lower], 1.0)  # [..., 1]: of the bin above
     index = jnp.arange(bins.shape[0])
-    weights = jnp.where(index == lower, 1.0 - share, jnp.where(index == lower + 1, share, 0.0))
+    weights = jnp.where(index == lower, 1.0 - share, jnp.where(index == lower + 1, share, 0.0))  # [..., K]
     return jnp.where(jnp.isnan(x), x, weights)
 
 
 def ordered_expectation(probs: ArrayLike, bins: ArrayLike) -> jax.Array:
-    """The mean of distributions over the bins: [..., K] -> [...], exactly 0 for mirror-symmetric ones. [TRA-10] to
-    [TRA-12]
+    """Means over the bins: [..., K] -> [...], exactly 0 for mirror-symmetric probabilities. [TRA-10] to [TRA-12]
 
     Raises:
       ValueError: an even number of bins, or a last axis of another length. [TRA-13]
     """
-    probs, bins = real(probs), jnp.asarray(bins)
-    valid = bins.ndim == 1 and bins.shape[0] >= 3 and bins.shape[0] % 2 == 1
-    require(valid, "bins", "a vector with an odd number of at least 3 entries", f"shape {list(bins.shape)}")
-    size = bins.shape[0]
-    require(
-        probs.ndim >= 1 and probs.shape[-1] == size, "probs", f"a last axis of {size}", f"shape {list(probs.shape)}"
-    )
+    probs, bins = widen(probs), jnp.asarray(bins)
+    require_shape("bins", bins.shape, "K")
+    require(len(bins) % 2 == 1 and len(bins) >= 3, "bins", "an odd number of at least 3", len(bins))
+    require_shape("probs", probs.shape, ..., len(bins))
     bins = jax.lax.stop_gradient(bins.astype(probs.dtype))
-    half = size // 2
-    # Differences first: a fused multiply-add of the separate products would leave a rounding error behind where they
-    # cancel.
-    difference = probs[..., half + 1 :] - probs[..., :half][..., ::-1]
+    half = len(bins) // 2
+    # The difference of each mirrored pair comes first: of two products, XLA would fuse one with the sum and round the
+    # other, and leave behind a rounding error where they should cancel.
+    difference = probs[..., half + 1 :] - probs[..., :half][..., ::-1]  # [..., K // 2]
     return jnp.sum(difference * bins[half + 1 :], axis=-1) + probs[..., half] * bins[half]

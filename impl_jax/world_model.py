@@ -8,7 +8,6 @@ from jax import lax
 from jax.lax import stop_gradient
 
 from impl_jax import networks, rssm
-from impl_jax.checks import require, require_same_shape, require_shape
 from impl_jax.distributions import (
     bernoulli_loss,
     bernoulli_mean,
@@ -21,7 +20,16 @@ from impl_jax.distributions import (
     symlog_mse_loss,
     unimix_log_probs,
 )
-from impl_jax.layers import Params, compute_dtype, exact_dtype
+from impl_jax.layers import Params
+from impl_jax.shapes import (
+    compute_dtype,
+    require,
+    require_keys,
+    require_observations,
+    require_same_shape,
+    require_shape,
+    wide_dtype,
+)
 from impl_jax.transforms import exponential_bins, symexp
 from spec import Config, Discrete, Image, Spaces, Vector
 
@@ -30,23 +38,22 @@ Arrays = Mapping[str, jax.Array]
 
 def continue_target(is_terminal: jax.Array, config: Config) -> jax.Array:
     """1 - is_terminal [...], times gamma for a "discounted" continue head; float32 or better. [WM-7]"""
-    alive = 1.0 - is_terminal.astype(exact_dtype(config))
+    alive = 1.0 - is_terminal.astype(wide_dtype(config))
     return alive * config.discount if config.continue_target == "discounted" else alive
 
 
 def kl_losses(posterior_logits: jax.Array, prior_logits: jax.Array, config: Config) -> tuple[jax.Array, jax.Array]:
-    """(dynamics, representation) [...] in nats: KL of [..., S, C], summed over latents, then at least free_nats.
-    [WM-10] to [WM-14]
+    """Dynamics and representation loss, at least free_nats: [..., S, C] twice -> [...] twice, nats. [WM-10] to [WM-14]
 
     Section "World model learning", losses L_dyn and L_rep.
     """
-    require_shape("posterior_logits", posterior_logits, *posterior_logits.shape[:-2], config.stoch, config.classes)
+    require_shape("posterior_logits", posterior_logits.shape, ..., config.stoch, config.classes)
     require_same_shape(posterior_logits=posterior_logits, prior_logits=prior_logits)
     posterior, prior = (unimix_log_probs(logits, config.latent_unimix) for logits in (posterior_logits, prior_logits))
 
     def clipped(p: jax.Array, q: jax.Array) -> jax.Array:
         kl = jnp.sum(categorical_kl(p, q), axis=-1)
-        # Selected, not a maximum: below the free nats the gradient is exactly zero, and a NaN stays.
+        # Selected, not a maximum: below the free nats the gradient is exactly 0, and a NaN stays.
         return jnp.where(kl < config.free_nats, jnp.asarray(config.free_nats, kl.dtype), kl)
 
     return clipped(stop_gradient(posterior), prior), clipped(posterior, stop_gradient(prior))
@@ -60,26 +67,21 @@ def reconstruction_losses(
     Raises:
       ValueError: a missing key, or a wrong shape or dtype. [WM-19]
     """
+    require_keys("predictions", predictions, spaces.observations)
+    leading = require_observations("observations", observations, spaces)
     result = {}
     for key, space in spaces.observations.items():
-        for name, mapping in (("predictions", predictions), ("observations", observations)):
-            require(key in mapping, name, f"the key {key!r}", f"the keys {sorted(mapping)}")
         prediction, x = predictions[key], observations[key]
-        leading = x.shape[: x.ndim - len(space.array_shape)]
-        require_shape(f"observation {key!r}", x, *leading, *space.array_shape)
         size = space.array_shape if isinstance(space, Image) else (space.encoded_size,)
-        require_shape(f"prediction {key!r}", prediction, *leading, *size)
+        require_shape(f"predictions[{key!r}]", prediction.shape, *leading, *size)
         if isinstance(space, Image):
-            require(x.dtype == jnp.uint8, f"observation {key!r}", "dtype uint8", x.dtype)
-            target = x.astype(exact_dtype(config)) / 255.0
+            target = x.astype(wide_dtype(config)) / 255.0
             result[key] = jnp.sum(mse_loss(prediction, target), axis=(-3, -2, -1))
         elif isinstance(space, Discrete):
-            require(jnp.issubdtype(x.dtype, jnp.integer), f"observation {key!r}", "an integer dtype", x.dtype)
             result[key] = -_discrete_log_prob(prediction, x, space)
         else:
-            result[key] = jnp.sum(
-                symlog_mse_loss(prediction, x.astype(exact_dtype(config)), config.vector_loss_scale), axis=-1
-            )
+            loss = symlog_mse_loss(prediction, x.astype(wide_dtype(config)), config.vector_loss_scale)
+            result[key] = jnp.sum(loss, axis=-1)
     return result
 
 
@@ -97,13 +99,15 @@ def _discrete_log_prob(logits: jax.Array, x: jax.Array, space: Discrete) -> jax.
 def world_model_losses(
     params: Params, batch: Arrays, states: Arrays, spaces: Spaces, config: Config
 ) -> dict[str, jax.Array]:
-    """All losses of the world model by name, [B, T] each, not weighted. [WM-1], [WM-6], [WM-8], [WM-9], [WM-15],
-    [WM-16]
+    """{name: [B, T]}, unweighted: "reconstruction/{key}", "reward", "continue", "dynamics", "representation".
 
-    states: what `observe` returned, {"deter" [B, T, D], "stoch" [B, T, S, C], "logits" [B, T, S, C]}.
+    [WM-1], [WM-6], [WM-8], [WM-9], [WM-15], [WM-16]
+    states: what `observe` returned, {"deter" [B, T, D], "stoch" and "logits" [B, T, S, C]}.
     """
+    require_keys("batch", batch, (*spaces.observations, "reward", "is_terminal"))
+    require_keys("states", states, ("deter", "stoch", "logits"))
     for key in ("reward", "is_terminal"):
-        require(key in batch, "batch", f"the key {key!r}", f"the keys {sorted(batch)}")
+        require_shape(f"batch[{key!r}]", batch[key].shape, *states["deter"].shape[:-1])
     feature = networks.feature(states["deter"], states["stoch"])
     bins = exponential_bins(config.bins)
     reconstruction = reconstruction_losses(networks.decoder(params, feature, spaces, config), batch, spaces, config)
@@ -130,9 +134,8 @@ def open_loop(
 ) -> dict[str, jax.Array]:
     """What the model sees coming, from a few observations and then actions alone. [WM-20] to [WM-24]
 
-    observation: key -> [B, T, ...], of which the first `context` steps are read; prev_action [B, T, A]; is_first [B,
-    T];
-    noise: {"posterior" [B, context, S], "prior" [B, T - context, S]}.
+    observation: key -> [B, T, ...], of which the first `context` steps are read; prev_action [B, T, A];
+    is_first [B, T]; noise: {"posterior" [B, context, S], "prior" [B, T - context, S]}.
 
     Returns:
       By observation key [B, T, ...]: numbers in their own units, probabilities, images in [0, 1]; "reward" and
@@ -141,19 +144,16 @@ def open_loop(
     Raises:
       ValueError: a missing key, a wrong shape or dtype, or a context that is not within the sequence.
     """
-    require_shape("is_first", is_first, "B", "T")
+    require_shape("is_first", is_first.shape, "B", "T")
     B, T = is_first.shape
     require(1 <= context < T, "context", f"1 to {T - 1} steps of {T}", context)
-    require_shape("prev_action", prev_action, B, T, spaces.action_size)
-    require_shape("noise posterior", noise["posterior"], B, context, config.stoch)
-    require_shape("noise prior", noise["prior"], B, T - context, config.stoch)
-    for key, space in spaces.observations.items():
-        require(key in observation, "observation", f"the key {key!r}", f"the keys {sorted(observation)}")
-        require_shape(f"observation {key!r}", observation[key], B, T, *space.array_shape)
+    require_shape("prev_action", prev_action.shape, B, T, spaces.action_size)
+    require_shape("noise['posterior']", noise["posterior"].shape, B, context, config.stoch)
+    require_shape("noise['prior']", noise["prior"].shape, B, T - context, config.stoch)
+    require_observations("observation", observation, spaces, (B, T))
 
-    tokens = networks.encoder(
-        params, {key: observation[key][:, :context] for key in spaces.observations}, spaces, config
-    )
+    known = {key: observation[key][:, :context] for key in spaces.observations}
+    tokens = networks.encoder(params, known, spaces, config)
     dtype = compute_dtype(config)
     start = {"deter": jnp.zeros((B, config.deter), dtype), "stoch": jnp.zeros((B, config.stoch, config.classes), dtype)}
     seen = rssm.observe(
@@ -163,7 +163,7 @@ def open_loop(
     def step(
         carry: dict[str, jax.Array], now: tuple[jax.Array, jax.Array, jax.Array]
     ) -> tuple[dict[str, jax.Array], Arrays]:
-        action, first, uniform = now
+        action, first, uniform = now  # [B, A], [B], [B, S]
         deter, stoch, action = (
             jnp.where(first.reshape(B, *[1] * (x.ndim - 1)), 0, x) for x in (carry["deter"], carry["stoch"], action)
         )

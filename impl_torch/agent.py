@@ -20,7 +20,7 @@ from impl_torch.behavior import (
 )
 from impl_torch.distributions import bernoulli_mean, symexp_twohot_mean
 from impl_torch.layers import Params, for_many_rows, truncated_normal
-from impl_torch.networks import Observations, actor, continue_head, critic, encoder, feature, reward_head
+from impl_torch.networks import actor, continue_head, critic, encoder, feature, reward_head
 from impl_torch.optimizer import optimizer_step
 from impl_torch.returns import (
     cumulative_weights,
@@ -30,7 +30,14 @@ from impl_torch.returns import (
     update_return_range,
 )
 from impl_torch.rssm import Carry, freeze, imagine_features, observe, observe_step, prepare
-from impl_torch.shapes import expect_keys, expect_shape, wide_dtype
+from impl_torch.shapes import (
+    Observations,
+    require_keys,
+    require_observations,
+    require_shape,
+    require_shapes,
+    wide_dtype,
+)
 from impl_torch.transforms import standard_bins
 from impl_torch.world_model import continue_target, world_model_losses
 from spec import Config, Parameter, Spaces, parameter_table
@@ -41,14 +48,12 @@ State = Mapping[str, Any]
 
 def initial_parameters(table: Mapping[str, Parameter], uniforms: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Every parameter of the table, from uniforms in the shape of each kernel. [AGT-1] [AGT-3] to [AGT-6]"""
-    expect_keys(
-        "uniforms", uniforms, (name for name, entry in table.items() if entry.initializer == "truncated_normal")
-    )
+    kernels = {name: entry.shape for name, entry in table.items() if entry.initializer == "truncated_normal"}
+    require_shapes("uniforms", uniforms, kernels)
     like = next(iter(uniforms.values()))
     params = {}
     for name, entry in table.items():
         if entry.initializer == "truncated_normal":
-            expect_shape(f"uniforms[{name!r}]", uniforms[name], entry.shape)
             params[name] = truncated_normal(uniforms[name], entry.fan_in, entry.outscale)
         else:
             params[name] = like.new_full(entry.shape, 1.0 if entry.initializer == "ones" else 0.0)
@@ -58,7 +63,6 @@ def initial_parameters(table: Mapping[str, Parameter], uniforms: Mapping[str, Te
 def initial_state(params: Mapping[str, Tensor]) -> dict[str, Any]:
     """A fresh training state. [AGT-7] [AGT-8] [OPT-13]"""
     zero = next(iter(params.values())).new_zeros(())
-
     return {
         "params": dict(params),
         "slow_critic": {name: x.detach().clone() for name, x in params.items() if name.startswith("critic/")},
@@ -94,9 +98,9 @@ def policy_step(
     tokens = encoder(params, observation, spaces, config)
     carry, _ = observe_step(params, carry, tokens, prev_action, is_first, noise["posterior"], config)
     outputs = actor(params, feature(carry["deter"], carry["stoch"]), spaces, config)
-    return dict(carry), mode_action(outputs, spaces, config) if mode else sample_action(
-        outputs, noise["action"], spaces, config
-    )
+    if mode:
+        return dict(carry), mode_action(outputs, spaces, config)
+    return dict(carry), sample_action(outputs, noise["action"], spaces, config)
 
 
 def losses(
@@ -113,11 +117,11 @@ def losses(
     [AGT-14] to [AGT-28] [RET-3] to [RET-6] [RET-11] [BEH-11] [BEH-16] [BEH-18]
     return_range: (low, high); batch: observations [B, T, ...], "reward", "is_first", "is_last", "is_terminal" [B, T],
     "prev_action" [B, T, A], "deter" [B, D], "stoch" [B, S] class indices;
-    noise: "posterior" [B, T, S], "prior" [N, H, S], "action" [N, H, K];
-    aux: "losses" {name: scalar} with gradients, "return_range", "deter" [B, T, D], "stoch" [B, T, S, C] and "metrics"
-    {name: scalar}.
+    noise: "posterior" [B, T, S], "prior" [N, H, S], "action" [N, H, K], with N = B * T;
+    aux: "losses" {name: scalar} with gradients, "return_range", "deter" [B, T, D], "stoch" [B, T, S, C], all constant,
+    and "metrics" {name: scalar}.
     """
-    B, T = _check(params, batch, noise, spaces, config)
+    B, T = _require_step(params, batch, noise, spaces, config)
     params = for_many_rows(prepare(params, config))
     frozen, slow_critic = freeze(params, config), for_many_rows(freeze(slow_critic, config))
     H = config.imagination_horizon
@@ -126,12 +130,12 @@ def losses(
 
     # World model.
     start = {"deter": batch["deter"].to(dtype), "stoch": F.one_hot(batch["stoch"].long(), config.classes).to(dtype)}
-    tokens = encoder(params, {key: batch[key] for key in spaces.observations}, spaces, config)
+    tokens = encoder(params, {key: batch[key] for key in spaces.observations}, spaces, config)  # [B, T, E]
     states = observe(params, start, tokens, batch["prev_action"], batch["is_first"], noise["posterior"], config)
-    values: dict[str, Tensor] = world_model_losses(params, batch, states, spaces, config)
+    values: dict[str, Tensor] = world_model_losses(params, batch, states, spaces, config)  # [B, T] each
 
-    # Imagination. The actor's outputs are kept with their gradients, so that its loss needs no second pass over the
-    # same states.
+    # Imagination from all N posterior states. It has no gradients, but the actor's outputs along it are kept with
+    # theirs: its loss then needs no second pass over the same states.
     constants = {name: states[name].detach() for name in ("deter", "stoch")}
     outputs = []
 
@@ -142,21 +146,22 @@ def losses(
 
     features, actions = imagine_features(
         frozen, {name: x.flatten(0, 1) for name, x in constants.items()}, policy, noise["prior"], config
-    )
-    logits = _over_time(lambda x: critic(params, x, config), features[:H])
+    )  # H+1 of [N, F], H of [N, A]
+    logits = _over_time(lambda x: critic(params, x, config), features[:H])  # [N, H, bins]
     with torch.no_grad():
         slow_logits = _over_time(lambda x: critic(slow_critic, x, config), features[:H])
         reward = _over_time(lambda x: symexp_twohot_mean(reward_head(frozen, x, config), bins), features[1:])
-        reward = F.pad(reward, (1, 0))  # the reward of state 0 has been earned: no formula reads it
-        continue_ = _over_time(lambda x: bernoulli_mean(continue_head(frozen, x, config)), features)
+        reward = F.pad(reward, (1, 0))  # [N, H+1]: the reward of state 0 has been earned, no formula reads it
+        continue_ = _over_time(lambda x: bernoulli_mean(continue_head(frozen, x, config)), features)  # [N, H+1]
         if config.start_continue == "true":
             continue_[:, 0] = continue_target(batch["is_terminal"], config).flatten()
-        last = symexp_twohot_mean(critic(frozen, features[H], config), bins)
-        value = torch.cat([symexp_twohot_mean(logits, bins), last.unsqueeze(1)], 1)
+        # The value of states 0 .. H-1 is the mean of logits that the loss needs anyway; the last is for the bootstrap.
+        last = symexp_twohot_mean(critic(frozen, features[H], config), bins)  # [N]
+        value = torch.cat([symexp_twohot_mean(logits, bins), last.unsqueeze(1)], 1)  # [N, H+1]
 
-    # Returns.
-    returns = lambda_return(reward, continue_, value, config.imagined_discount, config.return_lambda)
-    weight = cumulative_weights(continue_, config.imagined_discount)
+    # Returns. The range is updated first: this very step uses it.
+    returns = lambda_return(reward, continue_, value, config.imagined_discount, config.return_lambda)  # [N, H]
+    weight = cumulative_weights(continue_, config.imagined_discount)  # [N, H]
     low, high = update_return_range(*return_range, returns, config)
     scale = return_scale(low, high, config.return_limit)
 
@@ -164,15 +169,14 @@ def losses(
     policies = {
         key: {name: torch.stack([output[key][name] for output in outputs], 1) for name in outputs[0][key]}
         for key in spaces.actions
-    }
+    }  # [N, H, ...] each
     log_prob = action_log_prob(policies, torch.stack(actions, 1), spaces, config)
     entropy = action_entropy(policies, spaces, config)
     values["actor"] = actor_loss(log_prob, entropy, returns, value[:, :H], weight, scale, config)
     values["critic"] = critic_loss(logits, slow_logits, returns, weight, config)
     if T > 1:
-        values["replay_critic"] = _replay_critic_loss(
-            params, slow_critic, states, returns[:, 0].view(B, T), batch, config
-        )
+        annotation = returns[:, 0].view(B, T)  # the imagined return from each replayed state
+        values["replay_critic"] = _replay_critic_loss(params, slow_critic, states, annotation, batch, config)
 
     means = {name: x.mean() for name, x in values.items()}
     means.setdefault("replay_critic", returns.new_zeros(()))
@@ -189,34 +193,35 @@ def losses(
     return total, {"losses": means, "return_range": (low, high), **constants, "metrics": metrics}
 
 
-def _check(
+def _require_step(
     params: Params, batch: Observations, noise: Mapping[str, Tensor], spaces: Spaces, config: Config
 ) -> tuple[int, int]:
     """B and T, if everything has the names and shapes that belong to them. [CON-8] [CON-20]"""
     flags = ("reward", "is_first", "is_last", "is_terminal")
-    steps = {key: space.array_shape for key, space in spaces.observations.items()} | dict.fromkeys(flags, ())
-    steps["prev_action"] = (spaces.action_size,)
-    expect_keys("batch", batch, (*steps, "deter", "stoch"))
-    expect_keys("noise", noise, ("posterior", "prior", "action"))
-    # Which of the arrays is the wrong one is what most of the others say.
-    (B, T), _ = Counter((*batch[name].shape, 0, 0)[:2] for name in steps).most_common(1)[0]
-    for name, shape in steps.items():
-        expect_shape(f"batch[{name!r}]", batch[name], (B, T, *shape))
-    expect_shape("batch['deter']", batch["deter"], (B, config.deter))
-    expect_shape("batch['stoch']", batch["stoch"], (B, config.stoch))
-    H, S, K = config.imagination_horizon, config.stoch, spaces.action_noise_size
-    for name, expected in {"posterior": (B, T, S), "prior": (B * T, H, S), "action": (B * T, H, K)}.items():
-        expect_shape(f"noise[{name!r}]", noise[name], expected)
-    table = parameter_table(config, spaces)
-    expect_keys("params", params, table)
-    for name, entry in table.items():
-        expect_shape(f"params[{name!r}]", params[name], entry.shape)
+    require_keys("batch", batch, (*spaces.observations, *flags, "prev_action", "deter", "stoch"))
+    require_keys("noise", noise, ("posterior", "prior", "action"))
+    # B and T are what most arrays say, so that the error names the one that differs.
+    steps = (*spaces.observations, *flags, "prev_action")
+    (B, T), _ = Counter((*batch[key].shape, 0, 0)[:2] for key in steps).most_common(1)[0]
+    require_observations("batch", batch, spaces, (B, T))
+    for key in flags:
+        require_shape(f"batch[{key!r}]", batch[key].shape, B, T)
+    require_shape("batch['prev_action']", batch["prev_action"].shape, B, T, spaces.action_size)
+    require_shape("batch['deter']", batch["deter"].shape, B, config.deter)
+    require_shape("batch['stoch']", batch["stoch"].shape, B, config.stoch)
+    N, H = B * T, config.imagination_horizon
+    require_shape("noise['posterior']", noise["posterior"].shape, B, T, config.stoch)
+    require_shape("noise['prior']", noise["prior"].shape, N, H, config.stoch)
+    require_shape("noise['action']", noise["action"].shape, N, H, spaces.action_noise_size)
+    require_shapes("params", params, {name: entry.shape for name, entry in parameter_table(config, spaces).items()})
     return B, T
 
 
 def _over_time(head: Callable[[Tensor], Tensor], features: list[Tensor]) -> Tensor:
-    """A head at t imagined states [N, F] each -> [N, t, ...]: on the CPU step by step, in the cache; elsewhere all at
-    once."""
+    """A head at t imagined states [N, F] each -> [N, t, ...].
+
+    On the CPU step by step, so that the N rows stay in the cache; an accelerator takes all t * N rows at once.
+    """
     if features[0].device.type == "cpu":
         return torch.stack([head(x) for x in features], 1)
     return head(torch.stack(features)).transpose(0, 1)
@@ -231,7 +236,7 @@ def _replay_critic_loss(
     config: Config,
 ) -> Tensor:
     """[B, T-1], with gradients into the states. [AGT-25]"""
-    state = feature(states["deter"], states["stoch"])[:, :-1]
+    state = feature(states["deter"], states["stoch"])[:, :-1]  # [B, T-1, F]: the last step has no next reward
     with torch.no_grad():
         slow_logits = critic(slow_critic, state, config)
         reward, is_last, is_terminal = batch["reward"], batch["is_last"], batch["is_terminal"]
@@ -253,8 +258,7 @@ def gradients(
     spaces: Spaces,
     config: Config,
 ) -> tuple[dict[str, Tensor], Tensor, dict[str, Any]]:
-    """The gradient of the total by every parameter, zeros where there is none, with what `losses` returns. [AGT-28]
-    [AGT-32] [OPT-18]"""
+    """(gradients by every parameter, zeros where there are none; total; aux of `losses`). [AGT-28] [AGT-32] [OPT-18]"""
     leaves = {name: x if x.requires_grad else x.detach().requires_grad_() for name, x in params.items()}
     with torch.enable_grad():
         total, aux = losses(leaves, slow_critic, return_range, batch, noise, spaces, config)

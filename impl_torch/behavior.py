@@ -19,7 +19,7 @@ from impl_torch.distributions import (
     unimix_log_probs,
 )
 from impl_torch.networks import Outputs
-from impl_torch.shapes import expect_keys, expect_same_shape, expect_shape, widen
+from impl_torch.shapes import require_keys, require_same_shape, require_shape, require_shapes, widen
 from impl_torch.transforms import standard_bins
 from spec import Config, Spaces, Vector
 
@@ -74,23 +74,19 @@ class _Normal:
 
 def _distributions(outputs: Outputs, spaces: Spaces, config: Config) -> list[_Categorical | _Normal]:
     """The independent parts of a policy, in the order of a flat action."""
-    expect_keys("outputs", outputs, spaces.actions, exactly=True)
+    require_keys("outputs", outputs, spaces.actions, exactly=True)
     leading = _leading(outputs)
     parts: list[_Categorical | _Normal] = []
     for key, space in spaces.actions.items():
-        raw = outputs[key]
-        expect_keys(
-            f"outputs[{key!r}]", raw, ("mean", "std") if isinstance(space, Vector) else ("logits",), exactly=True
-        )
-        for name, x in raw.items():
-            expect_shape(f"outputs[{key!r}][{name!r}]", x, (*leading, space.encoded_size))
+        raw, names = outputs[key], ("mean", "std") if isinstance(space, Vector) else ("logits",)
+        require_keys(f"outputs[{key!r}]", raw, names, exactly=True)
+        for name in names:
+            require_shape(f"outputs[{key!r}][{name!r}]", raw[name].shape, *leading, space.encoded_size)
         if isinstance(space, Vector):
             parts.append(_Normal(*bounded_normal(raw["mean"], raw["std"], config.actor_min_std, config.actor_max_std)))
         else:
-            parts += [
-                _Categorical(unimix_log_probs(logits, config.actor_unimix))
-                for logits in raw["logits"].split(space.classes, -1)
-            ]
+            entries = raw["logits"].split(space.classes, -1)  # [..., classes] each
+            parts += [_Categorical(unimix_log_probs(logits, config.actor_unimix)) for logits in entries]
     return parts
 
 
@@ -100,10 +96,9 @@ def _leading(outputs: Outputs) -> torch.Size:
 
 @torch.no_grad()
 def sample_action(outputs: Outputs, noise: Tensor, spaces: Spaces, config: Config) -> Tensor:
-    """A flat action [..., A], constant, from noise [..., K]. [BEH-1] [BEH-3] [BEH-4] [BEH-5] [BEH-8] [BEH-22]
-    [BEH-23]"""
+    """A flat action [..., A], constant, from noise [..., K]. [BEH-1] to [BEH-5] [BEH-8] [BEH-22] [BEH-23]"""
     parts = _distributions(outputs, spaces, config)
-    expect_shape("noise", noise, (*_leading(outputs), spaces.action_noise_size))
+    require_shape("noise", noise.shape, *_leading(outputs), spaces.action_noise_size)
     pieces = noise.split([part.sizes[1] for part in parts], -1)
     return torch.cat([part.sample(piece) for part, piece in zip(parts, pieces, strict=True)], -1)
 
@@ -115,16 +110,15 @@ def mode_action(outputs: Outputs, spaces: Spaces, config: Config) -> Tensor:
 
 
 def action_log_prob(outputs: Outputs, action: Tensor, spaces: Spaces, config: Config) -> Tensor:
-    """Log-probability of a flat action [..., A], a constant, summed over everything: [...]. [BEH-5] [BEH-6] [BEH-22]
-    [BEH-23]"""
+    """Log-probability of a flat action [..., A], a constant, summed over all its parts: [...]. [BEH-5] [BEH-6]"""
     parts = _distributions(outputs, spaces, config)
-    expect_shape("action", action, (*_leading(outputs), spaces.action_size))
+    require_shape("action", action.shape, *_leading(outputs), spaces.action_size)
     pieces = action.detach().split([part.sizes[0] for part in parts], -1)
     return torch.stack([part.log_prob(piece) for part, piece in zip(parts, pieces, strict=True)]).sum(0)
 
 
 def action_entropy(outputs: Outputs, spaces: Spaces, config: Config) -> Tensor:
-    """Entropy of the policy in nats, summed over everything: [...]. [BEH-7] [BEH-22] [BEH-23]"""
+    """Entropy of the policy in nats, summed over all its parts: [...]. [BEH-7] [BEH-22] [BEH-23]"""
     return torch.stack([part.entropy() for part in _distributions(outputs, spaces, config)]).sum(0)
 
 
@@ -141,10 +135,10 @@ def actor_loss(
 
     [BEH-9] [BEH-10] [BEH-22] [BEH-23] [BEH-24]
     """
-    expect_same_shape(log_prob=log_prob, entropy=entropy, returns=returns, value=value, weight=weight)
+    require_same_shape(log_prob=log_prob, entropy=entropy, returns=returns, value=value, weight=weight)
     log_prob = widen(log_prob)
     scale = torch.as_tensor(scale)
-    expect_shape("scale", scale, ())
+    require_shape("scale", scale.shape)
     with torch.no_grad():
         advantage = (returns - value) / scale
     return -weight.detach() * (advantage * log_prob + config.entropy_scale * entropy)
@@ -155,36 +149,36 @@ def critic_loss(logits: Tensor, slow_logits: Tensor, returns: Tensor, weight: Te
 
     [BEH-12] [BEH-13] [BEH-22] [BEH-23] [BEH-24]
     """
-    expect_same_shape(returns=returns, weight=weight)
+    require_same_shape(weight=weight, returns=returns)
     return weight.detach() * _critic_cross_entropy(logits, slow_logits, returns, config)
 
 
 def replay_critic_loss(logits: Tensor, slow_logits: Tensor, returns: Tensor, is_last: Tensor, config: Config) -> Tensor:
-    """The same without weights and with the last steps of episodes masked: [B, T-1]. [BEH-14] [BEH-15] [BEH-22]
-    [BEH-23] [BEH-24]"""
-    expect_same_shape(returns=returns, is_last=is_last)
+    """The same without weights, 0 at the last steps of episodes: [B, T-1]. [BEH-14] [BEH-15] [BEH-22] to [BEH-24]"""
+    require_same_shape(is_last=is_last, returns=returns)
     loss = _critic_cross_entropy(logits, slow_logits, returns, config)
     return (1 - is_last.to(loss.dtype)) * loss
 
 
 def _critic_cross_entropy(logits: Tensor, slow_logits: Tensor, returns: Tensor, config: Config) -> Tensor:
-    expect_shape("logits", logits, (*returns.shape, config.bins))
-    expect_same_shape(logits=logits, slow_logits=slow_logits)
+    """Towards the return and towards the slow critic's mean: logits [..., bins] twice, returns [...] -> [...]."""
+    require_shape("logits", logits.shape, *returns.shape, config.bins)
+    require_same_shape(logits=logits, slow_logits=slow_logits)
     logits = widen(logits)
     bins = standard_bins(config.bins, logits.dtype, logits.device)
-    targets = torch.stack(
-        [returns.to(logits.dtype), symexp_twohot_mean(slow_logits.detach().to(logits.dtype), bins)], -1
-    )
+    slow_mean = symexp_twohot_mean(slow_logits.detach().to(logits.dtype), bins)
+    # Both targets at once [..., 2], so that they share one log-softmax over the bins and one way back through it.
+    targets = torch.stack([returns.to(logits.dtype), slow_mean], -1)
     towards_return, towards_slow = twohot_cross_entropies(unimix_log_probs(logits, 0.0), targets, bins).unbind(-1)
     return towards_return + config.slow_critic_scale * towards_slow
 
 
 @torch.no_grad()
 def update_slow_critic(slow: Mapping[str, Tensor], critic: Mapping[str, Tensor], decay: float) -> dict[str, Tensor]:
-    """decay * slow + (1 - decay) * critic, as a new mapping; critic may hold more than `critic/...`. [BEH-19] [BEH-20]
-    [BEH-21]"""
+    """decay * slow + (1 - decay) * critic, a new mapping; critic may hold more than `critic/...`. [BEH-19] to [BEH-21]
+
+    `Learner` does the same in place on flat buffers.
+    """
     live = {name: x for name, x in critic.items() if name.startswith("critic/")}
-    expect_keys("slow", slow, live, exactly=True)
-    for name, x in slow.items():
-        expect_shape(f"slow[{name!r}]", x, live[name].shape)
+    require_shapes("slow", slow, {name: x.shape for name, x in live.items()})
     return {name: decay * x + (1 - decay) * live[name].to(x.dtype) for name, x in slow.items()}

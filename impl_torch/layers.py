@@ -1,7 +1,10 @@
 """Layers: the parts that networks are built from. Chapter: spec/03-layers.md.
 
-Images are [..., H, W, C]. For PyTorch that is a "channels last" tensor seen through a permutation, so nothing is
-copied.
+Images are [..., H, W, C]. PyTorch calls that a "channels last" tensor seen through a permutation: nothing is copied.
+
+Parameters keep their own precision and are converted to the dtype of x, the compute dtype. Autograd takes the gradient
+back through that conversion, and what it sums in bfloat16 it rounds to bfloat16. The functions written by hand here are
+there to keep gradients of parameters in float32 [CON-23], or to keep less for the way back.
 """
 
 import math
@@ -12,7 +15,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812 (so it is called everywhere)
 from torch import Tensor
 
-from impl_torch.shapes import expect, expect_last, expect_shape, widen
+from impl_torch.shapes import require, require_shape, widen
 
 Params = Mapping[str, Tensor]
 
@@ -23,29 +26,23 @@ TRUNCATED_STD = 0.8796256610342398  # of the standard normal cut at +-2
 # thread never reaches oneDNN, and loses nothing.
 CONVOLUTION_ROWS = 256
 
-
 NARROW = (torch.bfloat16, torch.float16)
-_WIDE_OUTPUT = tuple(int(part) for part in torch.__version__.split(".")[:2]) >= (
-    2,
-    8,
-)  # torch.mm and torch.bmm know out_dtype
+_WIDE_OUTPUT = tuple(map(int, torch.__version__.split(".")[:2])) >= (2, 8)  # torch.mm and torch.bmm know out_dtype
 
 
 def wide_product(x: Tensor, y: Tensor) -> Tensor:
-    """x @ y, of two or three axes, in float32 or better whatever the dtype of x and y: for gradients of kernels.
-    [CON-23]"""
+    """x @ y, of two or three axes, in float32 or better whatever their dtype: for gradients of kernels. [CON-23]"""
     if x.dtype not in NARROW:
         return x @ y
     if _WIDE_OUTPUT and x.device.type == "cuda":
         return (torch.mm if x.ndim == 2 else torch.bmm)(x, y, out_dtype=torch.float32)
-    return x.float() @ y.float()
+    return x.float() @ y.float()  # products of two bfloat16 are exact in float32: this only widens the sum
 
 
 class _NarrowProduct(torch.autograd.Function):
-    """A linear or block-linear layer in bfloat16 with float32 gradients of kernel and bias: autograd would round them
-    to bfloat16.
+    """A linear or block-linear layer in bfloat16 whose kernel and bias have gradients in float32.
 
-    x [G, N, in], kernel [G, in, out], bias [G, 1, out] or None.
+    y = x W + b; x [G, N, in], W [G, in, out], b [G, 1, out] or None.
     """
 
     @staticmethod
@@ -57,6 +54,7 @@ class _NarrowProduct(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> Any:
+        # ∂x = ∂y Wᵀ [G, N, in], ∂W = xᵀ ∂y [G, in, out], ∂b = sum over N of ∂y [G, 1, out]
         x, kernel = ctx.saved_tensors
         kernel_dtype, bias_dtype = ctx.dtypes
         by_x = torch.bmm(gradient, kernel.mT) if ctx.needs_input_grad[0] else None
@@ -74,8 +72,7 @@ def _as_convolution(x: Tensor, rows: int) -> bool:
 
 
 def for_many_rows(params: Params) -> Params:
-    """The same parameters with kernels in the memory order that oneDNN wants, or every product would bring its kernel
-    into it first."""
+    """The same parameters with kernels in the memory order that oneDNN wants: each product would rearrange its own."""
 
     def arrange(x: Tensor) -> Tensor:
         fits = x.ndim in (2, 3) and _as_convolution(x, CONVOLUTION_ROWS)
@@ -85,21 +82,21 @@ def for_many_rows(params: Params) -> Params:
 
 
 def _pointwise(x: Tensor, weight: Tensor, bias: Tensor | None, groups: int) -> Tensor:
-    """The rows of x [N, in] as the pixels of one channels-last image; weight [out, in/groups]."""
+    """The rows of x [N, in] as the pixels of one channels-last image; weight [out, in/groups] -> [N, out]."""
     rows, inputs = x.shape
-    width = 32 if rows % 32 == 0 else 1
-    image = x.reshape(1, rows // width, width, inputs).permute(0, 3, 1, 2)
+    width = 32 if rows % 32 == 0 else 1  # the result is the same for every width
+    image = x.reshape(1, rows // width, width, inputs).permute(0, 3, 1, 2)  # [1, in, N/width, width], the same memory
     y = F.conv2d(image, weight[:, :, None, None], bias, groups=groups)
     return y.permute(0, 2, 3, 1).reshape(rows, -1)
 
 
 def linear(x: Tensor, kernel: Tensor, bias: Tensor | None) -> Tensor:
     """x @ kernel + bias over the last axis: [..., in], [in, out], [out] -> [..., out]. [LAY-1] [LAY-2] [LAY-15]"""
-    expect(kernel.ndim == 2, "kernel", "shape [in, out]", list(kernel.shape))
-    expect_last("x", x, kernel.shape[0])
+    require_shape("kernel", kernel.shape, "in", "out")
+    require_shape("x", x.shape, ..., kernel.shape[0])
     if bias is not None:
-        expect_shape("bias", bias, kernel.shape[1:])
-    rows = x.reshape(-1, x.shape[-1])
+        require_shape("bias", bias.shape, kernel.shape[1])
+    rows = x.reshape(-1, x.shape[-1])  # [N, in]
     if x.dtype in NARROW:
         y = _NarrowProduct.apply(rows[None], kernel[None], None if bias is None else bias[None, None])[0]
     else:
@@ -112,26 +109,25 @@ def linear(x: Tensor, kernel: Tensor, bias: Tensor | None) -> Tensor:
 
 
 def block_linear(x: Tensor, kernel: Tensor, bias: Tensor | None) -> Tensor:
-    """A linear layer of G contiguous blocks: [..., in], [G, in/G, out/G], [out] -> [..., out]. [LAY-1] [LAY-3]
-    [LAY-15]"""
-    expect(kernel.ndim == 3, "kernel", "shape [G, in/G, out/G]", list(kernel.shape))
+    """A linear layer of G blocks: [..., in], [G, in/G, out/G], [out] -> [..., out]. [LAY-1] [LAY-3] [LAY-15]"""
+    require_shape("kernel", kernel.shape, "G", "in/G", "out/G")
     blocks, inputs, outputs = kernel.shape
-    expect_last("x", x, blocks * inputs)
+    require_shape("x", x.shape, ..., blocks * inputs)
     if bias is not None:
-        expect_shape("bias", bias, (blocks * outputs,))
-    rows = x.reshape(-1, blocks * inputs)
+        require_shape("bias", bias.shape, blocks * outputs)
+    rows = x.reshape(-1, blocks * inputs)  # [N, in]
     if _as_convolution(x, len(rows)):
         weight = kernel.to(x.dtype).transpose(1, 2).reshape(blocks * outputs, inputs)
         y = _pointwise(rows, weight, None if bias is None else bias.to(x.dtype), blocks)
     else:
-        by_block = rows.view(-1, blocks, inputs).transpose(0, 1)
+        by_block = rows.view(-1, blocks, inputs).transpose(0, 1)  # [G, N, in/G]
         bias = None if bias is None else bias.view(blocks, 1, outputs)
         if x.dtype in NARROW:
             y = _NarrowProduct.apply(by_block, kernel, bias)
         else:
             kernel = kernel.to(x.dtype)
             y = torch.bmm(by_block, kernel) if bias is None else torch.baddbmm(bias.to(x.dtype), by_block, kernel)
-        y = y.transpose(0, 1).reshape(-1, blocks * outputs)
+        y = y.transpose(0, 1).reshape(-1, blocks * outputs)  # [G, N, out/G] -> [N, out]
     return y.view(*x.shape[:-1], blocks * outputs)
 
 
@@ -144,9 +140,9 @@ def normalize(x: Tensor, epsilon: float) -> tuple[Tensor, Tensor]:
 
 
 def rms_norm(x: Tensor, scale: Tensor, epsilon: float) -> Tensor:
-    """x / sqrt(mean(x^2) + epsilon) * scale over the last axis: [..., n] and [n] -> [..., n]. [LAY-1] [LAY-4]
-    [LAY-15]"""
-    expect_shape("scale", scale, x.shape[-1:])
+    """x / sqrt(mean(x^2) + epsilon) * scale over the last axis: [..., n], [n] -> [..., n]. [LAY-1] [LAY-4] [LAY-15]"""
+    require_shape("scale", scale.shape, "n")
+    require_shape("x", x.shape, ..., len(scale))
     normal, _ = normalize(x, epsilon)
     rounded = scale + (scale.to(x.dtype) - scale).detach()  # in this way its gradient is not rounded too [CON-23]
     return (normal * rounded).to(x.dtype)
@@ -158,7 +154,7 @@ def silu(x: Tensor) -> Tensor:
 
 
 def norm_silu(x: Tensor, scale: Tensor, epsilon: float) -> Tensor:
-    """silu(rms_norm(x, scale, epsilon)), fused. scale may have more axes than one: [..., k, n] and [k, n]."""
+    """silu(rms_norm(x, scale, epsilon)), fused: [..., n] and [n], or [..., k, n] and [k, n] for k norms at once."""
     return _NormSilu.apply(x, scale, epsilon)
 
 
@@ -175,16 +171,22 @@ def silu_slope(x: Tensor) -> Tensor:
 
 
 def norm_gradients(gradient: Tensor, normal: Tensor, inverse: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
-    """From the gradient by scale * normal, with `normal, inverse = normalize(x)`: the gradients by x and by scale."""
-    by_scale = (gradient * normal).sum(tuple(range(gradient.ndim - scale.ndim)))
-    scaled = gradient * scale
-    along = (scaled * normal).mean(-1, keepdim=True)
+    """From the gradient by scale * normal, with `normal, inverse = normalize(x)`: the gradients by x and by scale.
+
+    n = ρ x with ρ = 1 / sqrt(mean(x²) + epsilon) over N entries, so dn_j/dx_k = ρ (δ_jk - n_j n_k / N), and
+    ∂x = ρ (a - n mean(a n)) with a = gradient * scale.
+    """
+    by_scale = (gradient * normal).sum(tuple(range(gradient.ndim - scale.ndim)))  # over every row
+    scaled = gradient * scale  # a
+    along = (scaled * normal).mean(-1, keepdim=True)  # [..., 1]
     return torch.addcmul(scaled, normal, along, value=-1).mul_(inverse), by_scale
 
 
 class _NormSilu(torch.autograd.Function):
-    """Keeps nothing but its input and recomputes the rest, where autograd would keep, and read again, every
-    intermediate result."""
+    """Keeps its input alone and computes the rest again, where autograd would keep and read every intermediate result.
+
+    The way back is silu' times the gradient, and then `norm_gradients`.
+    """
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, scale: Tensor, epsilon: float) -> Tensor:
@@ -196,14 +198,16 @@ class _NormSilu(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, None]:
         x, scale = ctx.saved_tensors
         normal, inverse = normalize(x, ctx.epsilon)
-        wide = scale.to(x.dtype).to(normal.dtype)
+        wide = scale.to(x.dtype).to(normal.dtype)  # rounded to the compute dtype, as the way there multiplied it
         by_x, by_scale = norm_gradients(silu_slope(normal * wide).mul_(gradient), normal, inverse, wide)
         return by_x.to(x.dtype), by_scale.to(scale.dtype), None
 
 
 class _BiasGradient(torch.autograd.Function):
-    """y [..., out], to which the bias was added before; its gradient is summed here, in float32: libraries would round
-    it. [CON-23]"""
+    """y [..., out] as it is, the bias [out] having been added before: here its gradient is summed, in float32. [CON-23]
+
+    A convolution of bfloat16 would sum, and round, the gradient of its bias in bfloat16.
+    """
 
     @staticmethod
     def forward(ctx: Any, y: Tensor, bias: Tensor) -> Tensor:
@@ -220,13 +224,14 @@ def _inner_bias(bias: Tensor, dtype: torch.dtype) -> Tensor:
     return bias.detach().to(dtype) if dtype in NARROW else bias.to(dtype)
 
 
-def _check_convolution(x: Tensor, kernel: Tensor, bias: Tensor) -> None:
-    expect(x.ndim >= 3, "x", "shape [..., H, W, in]", list(x.shape))
-    expect(
-        kernel.ndim == 4 and tuple(kernel.shape[:2]) == (5, 5), "kernel", "shape [5, 5, in, out]", list(kernel.shape)
-    )
-    expect_last("x", x, kernel.shape[2])
-    expect_shape("bias", bias, kernel.shape[3:])
+def _require_images(x: Tensor, kernel: Tensor, bias: Tensor) -> None:
+    require_shape("kernel", kernel.shape, 5, 5, "in", "out")
+    require_shape("x", x.shape, ..., "H", "W", kernel.shape[2])
+    require_shape("bias", bias.shape, kernel.shape[3])
+
+
+def _require_even_sides(x: Tensor) -> None:
+    require(not (x.shape[-3] % 2 or x.shape[-2] % 2), "x", "an even height and width", list(x.shape))
 
 
 def _to_planes(x: Tensor) -> Tensor:
@@ -241,43 +246,43 @@ def _to_pixels(y: Tensor, x: Tensor) -> Tensor:
 
 
 def convolution(x: Tensor, kernel: Tensor, bias: Tensor, stride: int) -> Tensor:
-    """5x5 cross-correlation: [..., H, W, in], [5, 5, in, out], [out] -> [..., H/stride, W/stride, out]. [LAY-1] [LAY-6]
-    [LAY-15]"""
-    _check_convolution(x, kernel, bias)
-    expect(stride in (1, 2), "stride", "1 or 2", stride)
-    expect(stride == 1 or not (x.shape[-3] % 2 or x.shape[-2] % 2), "x", "even sides at stride 2", list(x.shape))
-    planes = _to_planes(x)
+    """5x5 cross-correlation: [..., H, W, in], [5, 5, in, out], [out] -> [..., H/stride, W/stride, out].
+
+    [LAY-1] [LAY-6] [LAY-15]
+    """
+    require(stride in (1, 2), "stride", "1 or 2", stride)
+    _require_images(x, kernel, bias)
+    planes, padding = _to_planes(x), 2
     if stride == 2:
-        planes = F.pad(planes, (1, 2, 1, 2))
-    inner = _inner_bias(bias, x.dtype)
-    y = _to_pixels(
-        F.conv2d(planes, kernel.to(x.dtype).permute(3, 2, 0, 1), inner, stride, padding=2 if stride == 1 else 0), x
-    )
+        _require_even_sides(x)
+        planes, padding = F.pad(planes, (1, 2, 1, 2)), 0  # one before and two behind: PyTorch's own is the same on both
+    weight, inner = kernel.to(x.dtype).permute(3, 2, 0, 1), _inner_bias(bias, x.dtype)  # [out, in, 5, 5]
+    y = _to_pixels(F.conv2d(planes, weight, inner, stride, padding), x)
     return _BiasGradient.apply(y, bias) if x.dtype in NARROW else y
 
 
 def transposed_convolution(x: Tensor, kernel: Tensor, bias: Tensor) -> Tensor:
-    """The adjoint of the stride-2 convolution: [..., H, W, in], [5, 5, in, out], [out] -> [..., 2H, 2W, out]. [LAY-1]
-    [LAY-7] [LAY-15]"""
-    _check_convolution(x, kernel, bias)
-    inner = _inner_bias(bias, x.dtype)
-    y = F.conv_transpose2d(_to_planes(x), kernel.to(x.dtype).permute(2, 3, 0, 1), inner, stride=2, padding=1)
-    y = _to_pixels(
-        y[:, :, :-1, :-1], x
-    )  # PyTorch pads on both sides alike, so one row and one column come out too many
+    """The adjoint of the stride-2 convolution: [..., H, W, in], [5, 5, in, out], [out] -> [..., 2H, 2W, out].
+
+    [LAY-1] [LAY-7] [LAY-15]
+    """
+    _require_images(x, kernel, bias)
+    weight, inner = kernel.to(x.dtype).permute(2, 3, 0, 1), _inner_bias(bias, x.dtype)  # [in, out, 5, 5]
+    y = F.conv_transpose2d(_to_planes(x), weight, inner, stride=2, padding=1)  # [N, out, 2H + 1, 2W + 1]
+    y = _to_pixels(y[:, :, :-1, :-1], x)  # PyTorch pads both sides alike: one row and one column are too many
     return _BiasGradient.apply(y, bias) if x.dtype in NARROW else y
 
 
 def max_pool(x: Tensor) -> Tensor:
     """Largest value of each 2x2 square: [..., H, W, C] -> [..., H/2, W/2, C]. [LAY-12] [LAY-15]"""
-    expect(x.ndim >= 3, "x", "shape [..., H, W, C]", list(x.shape))
-    expect(not (x.shape[-3] % 2 or x.shape[-2] % 2), "x", "even sides", list(x.shape))
+    require_shape("x", x.shape, ..., "H", "W", "C")
+    _require_even_sides(x)
     return _to_pixels(F.max_pool2d(_to_planes(x), 2), x)
 
 
 def upsample(x: Tensor) -> Tensor:
     """Every pixel twice in both directions: [..., H, W, C] -> [..., 2H, 2W, C]. [LAY-13] [LAY-15]"""
-    expect(x.ndim >= 3, "x", "shape [..., H, W, C]", list(x.shape))
+    require_shape("x", x.shape, ..., "H", "W", "C")
     return _to_pixels(F.interpolate(_to_planes(x), scale_factor=2, mode="nearest"), x)
 
 
@@ -285,21 +290,20 @@ def dense(params: Params, name: str, x: Tensor, epsilon: float) -> Tensor:
     """Linear, RMSNorm, SiLU with the parameters name/kernel, name/bias, name/scale: [..., in] -> [..., out]. [LAY-8]"""
     y = linear(x, params[f"{name}/kernel"], params[f"{name}/bias"])
     scale = params[f"{name}/scale"]
-    expect_shape(f"{name}/scale", scale, y.shape[-1:])
+    require_shape(f"{name}/scale", scale.shape, y.shape[-1])
     return norm_silu(y, scale, epsilon)
 
 
 def mlp(params: Params, name: str, x: Tensor, layers: int, epsilon: float) -> Tensor:
     """`layers` dense layers name/hidden0, name/hidden1, ...: [..., in] -> [..., out]. [LAY-8] [LAY-15]"""
-    expect(layers >= 1, "layers", "at least 1", layers)
+    require(layers >= 1, "layers", "at least 1", layers)
     for layer in range(layers):
         x = dense(params, f"{name}/hidden{layer}", x, epsilon)
     return x
 
 
 def truncated_normal(uniform: Tensor, fan_in: int, outscale: float) -> Tensor:
-    """Initial weights from uniforms, any shape: standard deviation outscale / sqrt(fan_in). [LAY-9] [LAY-10]
-    [LAY-11]"""
-    expect(fan_in >= 1, "fan_in", "at least 1", fan_in)
+    """Initial weights from uniforms, any shape: standard deviation outscale / sqrt(fan_in). [LAY-9] to [LAY-11]"""
+    require(fan_in >= 1, "fan_in", "at least 1", fan_in)
     normal = math.sqrt(2) * torch.erfinv((2 * uniform - 1) * math.erf(math.sqrt(2)))
     return normal.clamp(-2, 2) * (outscale / math.sqrt(fan_in) / TRUNCATED_STD)

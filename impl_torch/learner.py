@@ -12,7 +12,7 @@ from impl_torch.agent import gradients, initial_parameters, policy_step
 from impl_torch.optimizer import clip_flat_gradients_, flat_optimizer, flat_step_
 from impl_torch.parameters import Layout, Parameters
 from impl_torch.rssm import freeze
-from impl_torch.shapes import compute_dtype, expect, wide_dtype
+from impl_torch.shapes import compute_dtype, require, require_shapes, wide_dtype
 from impl_torch.world_model import open_loop
 from spec import Config, Discrete, Spaces, parameter_table
 
@@ -22,9 +22,11 @@ Arrays = Mapping[str, np.ndarray]
 class Learner:
     """One agent.
 
-    All of its state lies in a few flat buffers that a train step changes in place. seed: of the initial parameters.
-    nonfinite: "stop" or "skip", [LOOP-40] to [LOOP-42]. threads: that compute on the CPU, in the whole process; None
-    leaves them as they are.
+    All of its state lies in a few flat buffers that a train step changes in place (`parameters.py` says why): its
+    memory is taken once, and the mappings of names to tensors are views that never have to be made anew.
+
+    seed: of the initial parameters. nonfinite: "stop" or "skip", [LOOP-40] to [LOOP-42]. threads: that compute on the
+    CPU, in the whole process; None leaves them as they are.
 
     Raises:
       ValueError: a device that is unknown or not there, or another word for `nonfinite`.
@@ -40,7 +42,7 @@ class Learner:
         nonfinite: str = "stop",
         threads: int | None = None,
     ) -> None:
-        expect(nonfinite in ("stop", "skip"), "nonfinite", "'stop' or 'skip'", nonfinite)
+        require(nonfinite in ("stop", "skip"), "nonfinite", "'stop' or 'skip'", nonfinite)
         self._nonfinite, self._stopped = nonfinite, False
         self.spaces, self.config = spaces, config
         self._device = select_device(device)
@@ -66,9 +68,8 @@ class Learner:
         self._second_moment, self._momentum, self._gradient = (torch.zeros_like(self._flat) for _ in range(3))
         self._set_step(0)
         self._low, self._high = torch.zeros((2,), dtype=self._dtype, device=self._device).unbind()
-        self._acting: Mapping[str, Tensor] | None = (
-            None  # the parameters as the policy uses them, until the next train step
-        )
+        # The parameters as the policy uses them, with kernels in the compute dtype; until the next train step.
+        self._acting: Mapping[str, Tensor] | None = None
 
     def initial_carry(self, envs: int) -> dict[str, Tensor]:
         """All zeros: {"deter" [N, D], "stoch" [N, S, C], "action" [N, A]}. [CON-5]"""
@@ -97,12 +98,10 @@ class Learner:
     def policy(
         self, observation: Arrays, is_first: np.ndarray, carry: Mapping[str, Tensor], seed: int, mode: bool = False
     ) -> tuple[np.ndarray, Arrays, dict[str, Tensor]]:
-        """One acting step: observation {key: [N, ...]}, is_first [N], seed of the noise -> (action [N, A], latents,
-        carry). [AGT-11]
+        """One acting step of N environments with the noise of a seed: (action [N, A], latents, carry). [AGT-11]
 
-        mode: the action is the mode of the actor, [LOOP-71].
-
-        The latents may still be on their way.
+        observation {key: [N, ...]}, is_first [N]; mode: the action is the mode of the actor, [LOOP-71].
+        The latents {"deter" [N, D], "stoch" [N, S] class indices} may still be on their way.
         """
         generator = self._generator(seed)
         noise = {
@@ -144,24 +143,25 @@ class Learner:
                 "clip_fraction": (factors < 1).double().mean(),
                 "skipped": self._flat.new_full((), float(not applied)),
             }
+            # One array, one copy: every number by itself would be a copy, and a wait, of its own.
             values = _to_host(torch.stack([value.double() for value in metrics.values()]))
             latents = {"deter": _to_host(aux["deter"].float()), "stoch": _to_host(aux["stoch"].argmax(-1))}
         return {name: _Element(values, index) for index, name in enumerate(metrics)}, latents
 
     def gradients(self, batch: Arrays, seed: int) -> tuple[dict[str, float], dict[str, np.ndarray]]:
-        """The metrics and the gradient of every parameter that a train step would compute now. Changes nothing.
-        [LOOP-44]"""
+        """Metrics and gradients by name, as a train step would compute them now. Changes nothing. [LOOP-44]"""
         by_name, metrics, _, _ = self._differentiate(batch, seed)
-        return {name: float(x) for name, x in metrics.items()}, {
-            name: x.cpu().numpy().copy() for name, x in by_name.items()
-        }
+        numbers = {name: float(x) for name, x in metrics.items()}
+        return numbers, {name: x.cpu().numpy().copy() for name, x in by_name.items()}
 
     @torch.no_grad()
     def predict(
         self, observation: Arrays, prev_action: np.ndarray, is_first: np.ndarray, context: int, seed: int
     ) -> dict[str, np.ndarray]:
-        """The open-loop prediction of {key: [B, T, ...]}, prev_action [B, T, A], is_first [B, T], with the noise of a
-        seed. [WM-20]"""
+        """The open-loop prediction of recorded sequences, with the noise of a seed. [WM-20] to [WM-24]
+
+        observation {key: [B, T, ...]}, prev_action [B, T, A], is_first [B, T].
+        """
         generator, (B, T) = self._generator(seed), np.shape(is_first)
         noise = {
             "posterior": self._uniform(generator, B, max(0, context), self.config.stoch),
@@ -184,21 +184,11 @@ class Learner:
         """The inverse of `state_dict`. [AGT-10]
 
         Raises:
-          ValueError: a missing or unexpected name, or a wrong shape; nothing is changed then.
+          ValueError: a missing or unknown name, or a wrong shape; nothing is changed then.
         """
         tensors = self._tensors()
-        shapes: dict[str, tuple[int, ...]] = {name: tuple(x.shape) for name, x in tensors.items()} | {
-            "optimizer/step": ()
-        }
-        problems = [f"missing {name}" for name in sorted(set(shapes) - set(state))]
-        problems += [f"unexpected {name}" for name in sorted(set(state) - set(shapes))]
-        for name in sorted(set(shapes).intersection(state)):
-            if np.shape(state[name]) != shapes[name]:
-                problems.append(f"{name}: expected shape {list(shapes[name])}, got {list(np.shape(state[name]))}")
-        if problems:
-            raise ValueError(
-                "the training state does not fit this configuration and these spaces: " + "; ".join(problems)
-            )
+        shapes = {name: tuple(x.shape) for name, x in tensors.items()}
+        require_shapes("training state", state, shapes | {"optimizer/step": ()})
         for flat in (self._flat, self._second_moment, self._momentum, self._slow_flat):
             flat.zero_()  # the gaps between the tensors too
         for name, x in tensors.items():
@@ -210,8 +200,7 @@ class Learner:
     def _differentiate(
         self, batch: Arrays, seed: int
     ) -> tuple[dict[str, Tensor], dict[str, Tensor], Tensor, dict[str, Any]]:
-        """(gradients, metrics, what clipping multiplied each gradient by [P], aux); the clipped gradients are in
-        `_gradient`."""
+        """(gradients, metrics, factors of the clipping [P], aux); leaves the clipped gradients in `_gradient`."""
         config = self.config
         inputs = {name: self._to_device(x) for name, x in batch.items()}
         noise, return_range = self._train_noise(inputs, seed), (self._low, self._high)
@@ -219,6 +208,7 @@ class Learner:
             self.parameters.mapping(), self._slow_critic, return_range, inputs, noise, self.spaces, config
         )
         with torch.no_grad():
+            # Autograd gives each parameter a gradient of its own; from here on they are one vector.
             self._layout.pack(by_name.values(), out=self._gradient)
             norms, factors = clip_flat_gradients_(
                 self._gradient, self._flat, self._layout, config.agc_clip, config.agc_epsilon
@@ -234,19 +224,18 @@ class Learner:
         return by_name, metrics, factors, aux
 
     def _update(self, return_range: tuple[Tensor, Tensor]) -> Tensor:
-        """The whole training state takes the step of the clipped gradients. Returns the norm of what the parameters
-        moved by."""
+        """The whole training state takes the step of the clipped gradients; the norm of the parameters' movement."""
         config = self.config
         flat_step_(self._optimizer, self._flat, self._gradient, config)
-        self._slow_flat.lerp_(self._critic_flat, 1 - config.slow_critic_decay)
+        self._slow_flat.lerp_(self._critic_flat, 1 - config.slow_critic_decay)  # after the step: [BEH-21]
         self._low, self._high = return_range
         self._acting = None
+        # The update is the momentum times this number, and the momentum is still there.
         rate = self._optimizer.param_groups[0]["lr"]
         return torch.linalg.vector_norm(self._momentum) * (rate / (1 - config.beta1**self._step))
 
     def _tensors(self) -> dict[str, Tensor]:
-        """Everything in the training state but whole numbers, under canonical names; writing to a tensor changes the
-        state."""
+        """The training state under canonical names, but for the step; to write to a tensor is to change the state."""
         trees = {
             "params/": self._layout.views(self._flat),
             "slow_critic/": self._slow_critic,
@@ -266,7 +255,7 @@ class Learner:
     def _to_device(self, x: np.ndarray) -> Tensor:
         tensor = torch.as_tensor(np.ascontiguousarray(x))
         if self._device.type == "cuda":
-            return tensor.pin_memory().to(self._device, non_blocking=True)
+            return tensor.pin_memory().to(self._device, non_blocking=True)  # from pageable memory it would wait
         return tensor
 
     def _generator(self, seed: int) -> torch.Generator:
@@ -277,16 +266,15 @@ class Learner:
 
     def _action_noise(self, generator: torch.Generator, *leading: int) -> Tensor:
         """[..., K]: normals for a Vector, uniforms for a Discrete. [CON-19]"""
+        where: dict[str, Any] = {"generator": generator, "dtype": self._dtype, "device": self._device}
         parts = []
         for space in self.spaces.actions.values():
             draw = torch.rand if isinstance(space, Discrete) else torch.randn
-            parts.append(
-                draw(*leading, *space.array_shape, generator=generator, dtype=self._dtype, device=self._device)
-            )
+            parts.append(draw(*leading, *space.array_shape, **where))
         return torch.cat(parts, -1)
 
     def _train_noise(self, batch: Mapping[str, Tensor], seed: int) -> dict[str, Tensor]:
-        """[CON-20]"""
+        """All random numbers of a step, drawn on the device before its loops, which draw none. [CON-20]"""
         generator = self._generator(seed)
         (B, T), H, S = batch["reward"].shape, self.config.imagination_horizon, self.config.stoch
         return {
@@ -309,14 +297,11 @@ def select_device(device: str | None) -> torch.device:
         raise ValueError(f"unknown device {device!r}; expected cpu, gpu, cuda, gpu:<number> or cuda:<number>")
     kind, index = match[1] or "cuda", match[2]
     if kind == "cuda" and int(index or 0) >= torch.cuda.device_count():
-        build = (
-            "a build for CPUs only"
-            if torch.version.cuda is None and torch.version.hip is None
-            else f"{torch.cuda.device_count()} GPUs"
-        )
+        for_cpus = torch.version.cuda is None and torch.version.hip is None
+        build = "a build for CPUs only" if for_cpus else f"{torch.cuda.device_count()} GPUs"
         raise ValueError(
-            f"device {device!r} is not there: PyTorch {torch.__version__} has {build}; use "
-            f"--device cpu or install a build for GPUs"
+            f"device {device!r} is not there: PyTorch {torch.__version__} has {build}; "
+            "use --device cpu or install a build for GPUs"
         )
     return torch.device(kind, int(index)) if index else torch.device(kind)
 
@@ -341,11 +326,7 @@ class _Element:
         self._array, self._index = array, index
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
-        return (
-            np.asarray(self._array)[self._index : self._index + 1]
-            .reshape(())
-            .astype(np.float64 if dtype is None else dtype)
-        )
+        return np.array(np.asarray(self._array)[self._index], np.float64 if dtype is None else dtype)
 
     def __float__(self) -> float:
         return float(np.asarray(self._array)[self._index])

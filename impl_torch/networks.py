@@ -22,65 +22,39 @@ from impl_torch.layers import (
     transposed_convolution,
     upsample,
 )
-from impl_torch.shapes import compute_dtype, expect, expect_keys, expect_last, expect_shape, wide_dtype
+from impl_torch.shapes import Observations, compute_dtype, require_observations, require_shape, wide_dtype
 from impl_torch.transforms import symlog
-from spec import Config, Discrete, Image, Spaces, Vector
+from spec import Config, Discrete, Spaces, Vector
 from spec.parameters import bottleneck
 
-Observations = Mapping[str, Tensor]
 Outputs = Mapping[str, Mapping[str, Tensor]]
-# Pixels that go through a convolutional network at a time on the CPU, so that what a layer hands to the next one stays
+# On the CPU this many pixels go through a convolutional network at a time: what one layer hands to the next then stays
 # in the cache.
 CHUNK_PIXELS = 64 * 64 * 64
 
 
 def feature(deter: Tensor, stoch: Tensor) -> Tensor:
     """The model state that every head reads: [..., D], [..., S, C] -> [..., D + S*C]. [NET-1] [CON-4]"""
-    expect_shape("stoch", stoch, (*deter.shape[:-1], *stoch.shape[-2:]))
+    require_shape("stoch", stoch.shape, *deter.shape[:-1], "S", "C")
     return torch.cat([deter, stoch.flatten(-2).to(deter.dtype)], -1)
 
 
 def encoder(params: Params, observations: Observations, spaces: Spaces, config: Config) -> Tensor:
     """Raw observations {key: [..., *array_shape]} -> tokens [..., E]. [NET-2] to [NET-12] [NET-24] [NET-26] [NET-27]"""
-    check_observations(observations, spaces)
+    leading = require_observations("observations", observations, spaces)
     if spaces.images:
         bottleneck(config, spaces)  # refuses sides that cannot be halved
     tokens = []
     if spaces.vectors:
-        vector = torch.cat(
-            [encode_vector(observations[key], space, config) for key, space in spaces.vectors.items()], -1
-        )
-        tokens.append(
-            mlp(params, "encoder/vector", vector.to(compute_dtype(config)), config.encoder_layers, config.norm_epsilon)
-        )
+        vectors = [encode_vector(observations[key], space, config) for key, space in spaces.vectors.items()]
+        x = torch.cat(vectors, -1).to(compute_dtype(config))  # [..., sum of encoded sizes]
+        tokens.append(mlp(params, "encoder/vector", x, config.encoder_layers, config.norm_epsilon))  # [..., d]
     if spaces.images:
-        image = torch.cat([observations[key] for key in spaces.images], -1)
-        x = image.flatten(0, -4) if image.ndim > 3 else image.unsqueeze(0)
+        image = torch.cat([observations[key] for key in spaces.images], -1)  # uint8 [..., H, W, channels]
+        x = image.reshape(-1, *image.shape[-3:])  # still uint8: each chunk is converted in the cache
         x = _in_chunks(functools.partial(_encode_image, params, config=config), x, x.shape[1] * x.shape[2])
-        tokens.append(x.view(*image.shape[:-3], -1))
+        tokens.append(x.view(*leading, -1))  # [..., h0*w0*c0]
     return torch.cat(tokens, -1)
-
-
-def check_observations(observations: Observations, spaces: Spaces) -> None:
-    """Names, dtypes and shapes. [NET-2] [NET-4] [NET-6] [NET-27]
-
-    Raises:
-      ValueError: naming the key. Values of a Discrete are not looked at here: on an accelerator that would wait for the
-        device.
-    """
-    expect_keys("observations", observations, spaces.observations)
-    leading = None
-    for key, space in spaces.observations.items():
-        x = observations[key]
-        expect_last(f"observation {key!r}", x, *space.array_shape)
-        leading = x.shape[: x.ndim - len(space.array_shape)] if leading is None else leading
-        expect_shape(f"observation {key!r}", x, (*leading, *space.array_shape))
-        if isinstance(space, Image):
-            expect(x.dtype == torch.uint8, f"observation {key!r}", "dtype uint8", x.dtype)
-        elif isinstance(space, Discrete):
-            expect(
-                not x.is_floating_point() and x.dtype != torch.bool, f"observation {key!r}", "an integer dtype", x.dtype
-            )
 
 
 def encode_vector(x: Tensor, space: Vector | Discrete, config: Config) -> Tensor:
@@ -92,7 +66,7 @@ def encode_vector(x: Tensor, space: Vector | Discrete, config: Config) -> Tensor
 
 
 def _in_chunks(network: functools.partial[Tensor], x: Tensor, pixels: int) -> Tensor:
-    """The network on N images at once, on the CPU on a few at a time."""
+    """The network on N images [N, ...] at once, on the CPU on a few at a time."""
     size = max(1, CHUNK_PIXELS // pixels)
     if x.device.type != "cpu" or len(x) <= size:
         return network(x)
@@ -101,9 +75,8 @@ def _in_chunks(network: functools.partial[Tensor], x: Tensor, pixels: int) -> Te
 
 def _encode_image(params: Params, image: Tensor, config: Config) -> Tensor:
     """[N, H, W, channels] uint8 -> [N, h0*w0*c0]. [NET-6] to [NET-10] [LAY-14]"""
-    x = ((image.to(wide_dtype(config)) - 127.5) / 255).to(
-        compute_dtype(config)
-    )  # x/255 - 1/2 without the rounding of x/255
+    x = (image.to(wide_dtype(config)) - 127.5) / 255  # x/255 - 1/2 without the rounding of x/255
+    x = x.to(compute_dtype(config))  # rounded once, here
     for index in range(len(config.cnn_multipliers)):
         name = f"encoder/image/conv{index}"
         kernel, bias, scale = params[f"{name}/kernel"], params[f"{name}/bias"], params[f"{name}/scale"]
@@ -113,7 +86,7 @@ def _encode_image(params: Params, image: Tensor, config: Config) -> Tensor:
             x = convolution(x, kernel, bias, 2)
         else:
             x = max_pool(convolution(x, kernel, bias, 1))
-        x = norm_silu(x, scale, config.norm_epsilon)
+        x = norm_silu(x, scale, config.norm_epsilon)  # [N, h, w, c]
     return x.flatten(1)
 
 
@@ -122,7 +95,7 @@ def decoder(params: Params, feature: Tensor, spaces: Spaces, config: Config) -> 
 
     [NET-13] to [NET-19] [NET-24] to [NET-27]
     """
-    expect_last("feature", feature, config.feature_size)
+    require_shape("feature", feature.shape, ..., config.feature_size)
     x = feature.to(compute_dtype(config))
     outputs: dict[str, Tensor] = {}
     if spaces.vectors:
@@ -132,9 +105,8 @@ def decoder(params: Params, feature: Tensor, spaces: Spaces, config: Config) -> 
         image = next(iter(spaces.images.values()))
         network = functools.partial(_decode_image, params, spaces=spaces, config=config)
         pixels = _in_chunks(network, x.reshape(-1, x.shape[-1]), image.height * image.width)
-        parts = pixels.view(*x.shape[:-1], *pixels.shape[1:]).split(
-            [space.channels for space in spaces.images.values()], -1
-        )
+        channels = [space.channels for space in spaces.images.values()]
+        parts = pixels.view(*x.shape[:-1], *pixels.shape[1:]).split(channels, -1)  # [..., H, W, channels] each
         outputs |= dict(zip(spaces.images, parts, strict=True))
     return {key: outputs[key] for key in spaces.observations}
 
@@ -145,9 +117,10 @@ def _decode_image(params: Params, feature: Tensor, spaces: Spaces, config: Confi
     epsilon, strided = config.norm_epsilon, config.cnn_sampling == "strided"
     deter, stoch = feature.split([config.deter, config.stoch * config.classes], -1)
     memory = block_linear(deter, params["decoder/image/deter/kernel"], params["decoder/image/deter/bias"])
-    memory = memory.view(-1, config.blocks, height, width, channels // config.blocks).permute(0, 2, 3, 1, 4).flatten(-2)
+    memory = memory.view(-1, config.blocks, height, width, channels // config.blocks)  # [N, G, h0, w0, c0/G]
+    memory = memory.permute(0, 2, 3, 1, 4).flatten(-2)  # [N, h0, w0, c0]: each block has its own channels
     stoch = dense(params, "decoder/image/stoch_hidden", stoch, epsilon)
-    stoch = linear(stoch, params["decoder/image/stoch/kernel"], params["decoder/image/stoch/bias"])
+    stoch = linear(stoch, params["decoder/image/stoch/kernel"], params["decoder/image/stoch/bias"])  # [N, h0*w0*c0]
     x = norm_silu(memory + stoch.view_as(memory), params["decoder/image/stem/scale"], epsilon)
 
     def double(x: Tensor, name: str) -> Tensor:
@@ -167,7 +140,7 @@ def _out(params: Params, name: str, x: Tensor, config: Config) -> Tensor:
 
 
 def _hidden(params: Params, name: str, feature: Tensor, layers: int, config: Config) -> Tensor:
-    expect_last("feature", feature, config.feature_size)
+    require_shape("feature", feature.shape, ..., config.feature_size)
     return mlp(params, name, feature.to(compute_dtype(config)), layers, config.norm_epsilon)
 
 
@@ -178,9 +151,8 @@ def reward_head(params: Params, feature: Tensor, config: Config) -> Tensor:
 
 def continue_head(params: Params, feature: Tensor, config: Config) -> Tensor:
     """Logit of going on: [..., F] -> [...]. [NET-21] [NET-26]"""
-    return _out(
-        params, "continue/out", _hidden(params, "continue", feature, config.continue_layers, config), config
-    ).squeeze(-1)
+    hidden = _hidden(params, "continue", feature, config.continue_layers, config)
+    return _out(params, "continue/out", hidden, config).squeeze(-1)
 
 
 def critic(params: Params, feature: Tensor, config: Config) -> Tensor:
@@ -189,8 +161,7 @@ def critic(params: Params, feature: Tensor, config: Config) -> Tensor:
 
 
 def actor(params: Params, feature: Tensor, spaces: Spaces, config: Config) -> dict[str, dict[str, Tensor]]:
-    """Raw outputs: [..., F] -> {key: {"logits": [..., sum of classes]} or {"mean": [..., size], "std": [..., size]}}.
-    [NET-22] [NET-26]"""
+    """Raw outputs: [..., F] -> {key: {"logits": [..., sum of classes]} or {"mean", "std": [..., size]}}. [NET-22]"""
     x = _hidden(params, "actor", feature, config.actor_layers, config)
     return {
         key: {

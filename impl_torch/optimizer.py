@@ -2,6 +2,9 @@
 
 `LaProp` is an ordinary `torch.optim.Optimizer`, and `clip_gradients_` works before any optimizer as
 `torch.nn.utils.clip_grad_norm_` does; both can be used alone. The functions of the chapter's names return new tensors.
+
+Training uses the functions whose names have `flat`: the parameters, their gradients and both moments each are one long
+vector (see `parameters.py`), so that a step is a dozen operations instead of a dozen for each of a hundred tensors.
 """
 
 import math
@@ -12,12 +15,12 @@ import torch
 from torch import Tensor
 
 from impl_torch.parameters import ROW, Layout
-from impl_torch.shapes import expect, expect_keys, expect_same_shape, expect_shape, wide_dtype, widen
+from impl_torch.shapes import require, require_same_shape, require_shapes, wide_dtype, widen
 from spec import Config
 
-DEAD_ZONE = 1e-16  # [OPT-9]
-# Numbers that the CPU updates at a time: the whole chain of operations on them runs in the cache, not once through
-# memory for each.
+DEAD_ZONE = 1e-16  # gradients below it count as zero: their squares would leave the normal numbers of float32 [OPT-9]
+# The CPU updates this many numbers at a time: the chain of operations on them then runs in the cache, where each would
+# go through memory from end to end.
 CHUNK = 1 << 17
 
 
@@ -39,7 +42,7 @@ def _clip_factor(gradient_norm: Tensor, parameter_norm: Tensor, clip: float, eps
 def adaptive_gradient_clip(gradient: Tensor, parameter: Tensor, clip: float, epsilon: float) -> Tensor:
     """The gradient, no longer than clip * max(epsilon, norm(parameter)); any shape. [OPT-1] to [OPT-5]"""
     gradient, parameter = widen(gradient), widen(parameter)  # [OPT-19]
-    expect_same_shape(parameter=parameter, gradient=gradient)
+    require_same_shape(parameter=parameter, gradient=gradient)
     return gradient * _clip_factor(_norm(gradient), _norm(parameter), clip, epsilon)
 
 
@@ -61,22 +64,25 @@ def clip_flat_gradients_(
     """
     norms, parameter_norms = (_norms(x.view(-1, ROW), layout) for x in (gradients, parameters))
     factors = _clip_factor(norms, parameter_norms, clip, epsilon)
-    gradients.view(-1, ROW).mul_(factors.to(gradients.dtype)[layout.owners(gradients.device)].unsqueeze(-1))
+    by_row = factors.to(gradients.dtype)[layout.owners(gradients.device)]  # [P] -> [R]: no row has two tensors
+    gradients.view(-1, ROW).mul_(by_row.unsqueeze(-1))
     return norms, factors
 
 
 def _norms(rows: Tensor, layout: Layout) -> Tensor:
-    """Norm of each tensor [P], float64, from the rows of a flat buffer [R, ROW]: of its rows, of the norms of its rows,
-    and so on."""
+    """Norm of each tensor [P], float64, from the rows of a flat buffer [R, ROW].
+
+    It is the norm of the norms of its rows, and those are folded into rows again until one number is left for each.
+    """
     pieces = rows.split(CHUNK // ROW) if rows.device.type == "cpu" else [rows]
-    norms = torch.cat([_row_norms(piece) for piece in pieces])
+    norms = torch.cat([_row_norms(piece) for piece in pieces])  # [R]
     for size, places in layout.folds(rows.device):
-        norms = _row_norms(norms.new_zeros(size).index_copy_(0, places, norms).view(-1, ROW))
+        norms = _row_norms(norms.new_zeros(size).index_copy_(0, places, norms).view(-1, ROW))  # [size / ROW]
     return norms
 
 
 def _row_norms(rows: Tensor) -> Tensor:
-    """Norm of each row [R], float64. [OPT-3]"""
+    """Norm of each row [R], float64: the squares are those of numbers up to 1, which cannot overflow. [OPT-3]"""
     peaks = rows.abs().amax(1, keepdim=True)  # PyTorch's infinity norm takes twenty times as long
     norms = torch.linalg.vector_norm(rows / torch.where(peaks == 0, 1, peaks), dim=1, keepdim=True)
     return (peaks.double() * norms.double()).squeeze(1)
@@ -90,9 +96,14 @@ def learning_rate(step: int, config: Config) -> float:
 
 
 def _correction(beta: float, step: int) -> float:
-    """1 - beta^t for t = step + 1, in float64. [OPT-11] [OPT-14]"""
-    expect(0 <= beta < 1, "beta", "at least 0 and below 1", beta)
+    """1 - beta^t for t = step + 1, in float64, without the cancellation of forming the power first. [OPT-11]"""
     return -math.expm1((step + 1) * math.log(beta)) if beta else 1.0
+
+
+def _require_betas(beta1: float, beta2: float) -> None:
+    """At 1 the bias correction would be 0/0. [OPT-14]"""
+    for name, beta in (("beta1", beta1), ("beta2", beta2)):
+        require(0 <= beta < 1, name, "at least 0 and below 1", beta)
 
 
 def _laprop_(
@@ -100,14 +111,18 @@ def _laprop_(
 ) -> None:
     """Updates both moments in place and subtracts rate * update from `out`; all of one shape. [OPT-8] to [OPT-12]
 
-    tensors: gradient, second moment, momentum, out.
+    tensors: gradient g, second moment v, momentum m, out. In place and with one scratch tensor:
+
+        v = beta2 v + (1 - beta2) g²,  m = beta1 m + (1 - beta1) g / (sqrt(v / c2) + epsilon),  out -= rate m / c1
+
+    where c is 1 - beta^(step + 1). The corrections are numbers of the host: nothing here waits for a device.
     """
     gradient, second_moment, momentum, out = tensors
     beta1, beta2 = betas
-    first, second = _correction(beta1, step), _correction(beta2, step)
+    first, second = _correction(beta1, step), _correction(beta2, step)  # c1, c2
     gradient = gradient.masked_fill(gradient.abs() < DEAD_ZONE, 0)
     second_moment.mul_(beta2).addcmul_(gradient, gradient, value=1 - beta2)
-    size = torch.div(second_moment, second).sqrt_().add_(epsilon)
+    size = torch.div(second_moment, second).sqrt_().add_(epsilon)  # of recent gradients; then, as scratch, g / size
     # Where the gradient is 0 its share is 0, not 0/0: [OPT-10].
     momentum.mul_(beta1).add_(torch.div(gradient, size, out=size).masked_fill_(gradient == 0, 0), alpha=1 - beta1)
     out.add_(momentum, alpha=-rate / first)
@@ -118,11 +133,11 @@ def laprop(
     gradient: Tensor, second_moment: Tensor, momentum: Tensor, step: int, config: Config
 ) -> tuple[Tensor, Tensor, Tensor]:
     """(update, new second moment, new momentum), without learning rate and sign; any shape. [OPT-8] to [OPT-14]"""
-    expect_same_shape(gradient=gradient, second_moment=second_moment, momentum=momentum)
+    _require_betas(config.beta1, config.beta2)
+    require_same_shape(gradient=gradient, second_moment=second_moment, momentum=momentum)
     second_moment, momentum, update = second_moment.clone(), momentum.clone(), torch.zeros_like(momentum)
-    _laprop_(
-        (gradient, second_moment, momentum, update), step, (config.beta1, config.beta2), config.laprop_epsilon, -1.0
-    )
+    tensors, betas = (gradient, second_moment, momentum, update), (config.beta1, config.beta2)
+    _laprop_(tensors, step, betas, config.laprop_epsilon, -1.0)  # 0 - (-1) * update
     return update, second_moment, momentum
 
 
@@ -139,8 +154,7 @@ class LaProp(torch.optim.Optimizer):
     def __init__(
         self, params: Any, lr: float = 4e-5, betas: tuple[float, float] = (0.9, 0.99), eps: float = 1e-20
     ) -> None:
-        for beta in betas:
-            _correction(beta, 0)
+        _require_betas(*betas)
         super().__init__(params, {"lr": lr, "betas": betas, "eps": eps})
 
     @torch.no_grad()
@@ -198,15 +212,10 @@ def optimizer_step(
     state: {"step": int, "second_moment": {name: tensor}, "momentum": {name: tensor}}.
     """
     trees = {"gradients": gradients, "second_moment": state["second_moment"], "momentum": state["momentum"]}
+    shapes = {name: tuple(x.shape) for name, x in params.items()}
     for what, tree in trees.items():
-        expect_keys(what, tree, params, exactly=True)
-        for name, x in params.items():
-            expect_shape(f"{what}[{name!r}]", tree[name], x.shape)
-    layout, dtype, step = (
-        Layout({name: tuple(x.shape) for name, x in params.items()}),
-        wide_dtype(config),
-        int(state["step"]),
-    )
+        require_shapes(what, tree, shapes)
+    layout, dtype, step = Layout(shapes), wide_dtype(config), int(state["step"])
     flat, gradient, second_moment, momentum = (
         layout.pack(tree[name].to(dtype) for name in params) for tree in (params, *trees.values())
     )
@@ -227,6 +236,6 @@ def flat_optimizer(flat: Tensor, second_moment: Tensor, momentum: Tensor, step: 
 def flat_step_(optimizer: LaProp, flat: Tensor, gradient: Tensor, config: Config) -> None:
     """One update of a flat buffer, in place, by a gradient that `clip_flat_gradients_` has clipped."""
     optimizer.param_groups[0]["lr"] = learning_rate(optimizer.state[flat]["step"], config)
-    flat.grad = gradient
+    flat.grad = gradient  # for this call alone: the buffer of gradients is the learner's
     optimizer.step()
     flat.grad = None

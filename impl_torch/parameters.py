@@ -16,15 +16,16 @@ ROW = 64  # every tensor starts at a multiple of this many numbers: aligned for 
 
 
 class Layout:
-    """Where each tensor lies in a flat buffer. The gaps between them hold zeros and stay zero.
+    """Where each tensor lies in a flat buffer: in whole rows of ROW numbers, P tensors in R rows.
 
+    The gaps behind them hold zeros and stay zero: a gradient of 0 moves nothing, and adds nothing to a norm.
     shapes: name -> shape, in the order of the buffer.
     """
 
     def __init__(self, shapes: Mapping[str, tuple[int, ...]]) -> None:
         self.shapes = {name: tuple(shape) for name, shape in shapes.items()}
         self.sizes = {name: math.prod(shape) for name, shape in self.shapes.items()}
-        self.rows = {name: -(-size // ROW) for name, size in self.sizes.items()}
+        self.rows = {name: -(-size // ROW) for name, size in self.sizes.items()}  # rounded up
         self.total = ROW * sum(self.rows.values())
         self._owners: dict[torch.device, Tensor] = {}
         self._folds: dict[torch.device, list[tuple[int, Tensor]]] = {}
@@ -38,7 +39,7 @@ class Layout:
         }
 
     def pack(self, tensors: Iterable[Tensor], out: Tensor | None = None) -> Tensor:
-        """One flat buffer [total] out of all tensors, in the order of the names; a new one, or `out`."""
+        """One flat buffer [total] out of all tensors, in the order of the names: one copy; a new buffer, or `out`."""
         pieces = []
         for (name, rows), x in zip(self.rows.items(), tensors, strict=True):
             gap = ROW * rows - self.sizes[name]
@@ -46,15 +47,14 @@ class Layout:
         return torch.cat(pieces, out=out)
 
     def owners(self, device: torch.device) -> Tensor:
-        """Which tensor each row belongs to: [total / ROW]."""
+        """Which tensor each row belongs to: [R]."""
         if device not in self._owners:
             counts = torch.tensor(list(self.rows.values()), device=device)
             self._owners[device] = torch.arange(len(counts), device=device).repeat_interleave(counts)
         return self._owners[device]
 
     def folds(self, device: torch.device) -> list[tuple[int, Tensor]]:
-        """How to get from one number for each row to one number for each tensor, a row of numbers becoming one each
-        time.
+        """How to get from one number per row [R] to one per tensor [P]: every fold makes one number of up to ROW.
 
         A fold is the size of a buffer and the places in it of the numbers; its other places hold zeros. Unlike a sum by
         owners, which adds in any order on a GPU, this always gives the same sum.
@@ -62,7 +62,7 @@ class Layout:
         if device not in self._folds:
             self._folds[device], layout = [], self
             while max(layout.rows.values()) > 1:
-                layout = Layout({name: (rows,) for name, rows in layout.rows.items()})
+                layout = Layout({name: (rows,) for name, rows in layout.rows.items()})  # of one number for each row
                 places = torch.arange(layout.total).split([ROW * rows for rows in layout.rows.values()])
                 used = torch.cat([place[:size] for place, size in zip(places, layout.sizes.values(), strict=True)])
                 self._folds[device].append((layout.total, used.to(device)))

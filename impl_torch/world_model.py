@@ -20,9 +20,19 @@ from impl_torch.distributions import (
     unimix_probs,
 )
 from impl_torch.layers import Params
-from impl_torch.networks import Observations, check_observations, continue_head, decoder, encoder, feature, reward_head
+from impl_torch.networks import continue_head, decoder, encoder, feature, reward_head
 from impl_torch.rssm import core, observe, prepare, prior
-from impl_torch.shapes import compute_dtype, expect, expect_keys, expect_same_shape, expect_shape, wide_dtype, widen
+from impl_torch.shapes import (
+    Observations,
+    compute_dtype,
+    require,
+    require_keys,
+    require_observations,
+    require_same_shape,
+    require_shape,
+    wide_dtype,
+    widen,
+)
 from impl_torch.transforms import standard_bins, symexp
 from spec import Config, Discrete, Image, Spaces, Vector
 
@@ -34,9 +44,12 @@ def continue_target(is_terminal: Tensor, config: Config) -> Tensor:
 
 
 def kl_losses(posterior_logits: Tensor, prior_logits: Tensor, config: Config) -> tuple[Tensor, Tensor]:
-    """Dynamics and representation loss in nats, at least free_nats: [..., S, C] twice -> [...] twice. [WM-9] to
-    [WM-14]"""
-    expect_same_shape(posterior_logits=posterior_logits, prior_logits=prior_logits)
+    """Dynamics and representation loss, at least free_nats: [..., S, C] twice -> [...] twice, nats. [WM-9] to [WM-14]
+
+    Where a KL is below the free nats, the gradient of the clamp is exactly 0.
+    """
+    require_shape("posterior_logits", posterior_logits.shape, ..., config.stoch, config.classes)
+    require_same_shape(posterior_logits=posterior_logits, prior_logits=prior_logits)
     posterior = unimix_log_probs(posterior_logits, config.latent_unimix)
     prior = unimix_log_probs(prior_logits.to(posterior.dtype), config.latent_unimix)
     dynamics = categorical_kl(posterior.detach(), prior).sum(-1)
@@ -47,15 +60,14 @@ def kl_losses(posterior_logits: Tensor, prior_logits: Tensor, config: Config) ->
 def reconstruction_losses(
     predictions: Observations, observations: Observations, spaces: Spaces, config: Config
 ) -> dict[str, Tensor]:
-    """{key: [...]} from the decoder's output and the raw observations. [WM-2] [WM-3] [WM-4] [WM-5] [WM-17] [WM-18]
-    [WM-19]"""
-    expect_keys("predictions", predictions, spaces.observations)
-    check_observations(observations, spaces)
+    """{key: [...]} from the decoder's output and the raw observations. [WM-2] to [WM-5] [WM-17] to [WM-19]"""
+    require_keys("predictions", predictions, spaces.observations)
+    leading = require_observations("observations", observations, spaces)
     losses = {}
     for key, space in spaces.observations.items():
         prediction, target = widen(predictions[key]), observations[key]
         size = space.array_shape if isinstance(space, Image) else (space.encoded_size,)
-        expect_shape(f"prediction {key!r}", prediction, (*target.shape[: target.ndim - len(space.array_shape)], *size))
+        require_shape(f"predictions[{key!r}]", prediction.shape, *leading, *size)
         if isinstance(space, Vector):
             losses[key] = symlog_mse_loss(prediction, target, config.vector_loss_scale).sum(-1)
         elif isinstance(space, Image):
@@ -78,12 +90,12 @@ def world_model_losses(
     [WM-1] [WM-6] [WM-8] [WM-15] [WM-16]
     batch: raw observations, "reward" and "is_terminal" [B, T]; states: what `observe` returns.
     """
-    expect_keys("batch", batch, (*spaces.observations, "reward", "is_terminal"))
-    expect_keys("states", states, ("deter", "stoch", "logits"))
-    shape = states["deter"].shape[:-1]
+    require_keys("batch", batch, (*spaces.observations, "reward", "is_terminal"))
+    require_keys("states", states, ("deter", "stoch", "logits"))
+    leading = states["deter"].shape[:-1]
     for key in ("reward", "is_terminal"):
-        expect_shape(f"batch[{key!r}]", batch[key], shape)
-    state = feature(states["deter"], states["stoch"])
+        require_shape(f"batch[{key!r}]", batch[key].shape, *leading)
+    state = feature(states["deter"], states["stoch"])  # [B, T, F]: read by all heads, so joined once
     reconstructions = reconstruction_losses(decoder(params, state, spaces, config), batch, spaces, config)
     dynamics, representation = kl_losses(states["logits"], prior(params, states["deter"], config), config)
     bins = standard_bins(config.bins, wide_dtype(config), state.device)
@@ -107,25 +119,23 @@ def open_loop(
     spaces: Spaces,
     config: Config,
 ) -> dict[str, Tensor]:
-    """{key: [B, T, ...]} in the observations' own units, probabilities for a Discrete, with "reward" and "continue_"
-    [B, T].
+    """What the model sees coming, from a few observations and then actions alone. [WM-20] to [WM-24]
 
-    [WM-20] [WM-21] [WM-22] [WM-23] [WM-24]
     observation {key: [B, T, ...]}, read up to `context`; prev_action [B, T, A]; is_first [B, T];
     noise: "posterior" [B, context, S], "prior" [B, T-context, S].
+    Returns {key: [B, T, ...]} in the observations' own units, probabilities for a Discrete, and "reward" and
+    "continue_" [B, T].
 
     Raises:
       ValueError: a context outside of 1 ... T-1, or what `encoder` and `observe` refuse.
     """
-    expect(is_first.ndim == 2, "is_first", "shape [B, T]", list(is_first.shape))
+    require_shape("is_first", is_first.shape, "B", "T")
     B, T = is_first.shape
-    expect(1 <= context < T, "context", f"1 to {T - 1} steps of {T}", context)
-    expect_shape("prev_action", prev_action, (B, T, spaces.action_size))
-    expect_shape("noise['posterior']", noise["posterior"], (B, context, config.stoch))
-    expect_shape("noise['prior']", noise["prior"], (B, T - context, config.stoch))
-    expect_keys("observation", observation, spaces.observations)
-    for key, space in spaces.observations.items():
-        expect_shape(f"observation {key!r}", observation[key], (B, T, *space.array_shape))
+    require(1 <= context < T, "context", f"1 to {T - 1} steps of {T}", context)
+    require_shape("prev_action", prev_action.shape, B, T, spaces.action_size)
+    require_shape("noise['posterior']", noise["posterior"].shape, B, context, config.stoch)
+    require_shape("noise['prior']", noise["prior"].shape, B, T - context, config.stoch)
+    require_observations("observation", observation, spaces, (B, T))
 
     params, dtype = prepare(params, config), compute_dtype(config)
     tokens = encoder(params, {key: observation[key][:, :context] for key in spaces.observations}, spaces, config)

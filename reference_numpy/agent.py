@@ -31,7 +31,7 @@ from reference_numpy.returns import (
     update_return_range,
 )
 from reference_numpy.rssm import imagine, observe, observe_step
-from reference_numpy.shapes import checked, require_shape
+from reference_numpy.shapes import require, require_keys, require_observations, require_shape, require_shapes
 from reference_numpy.stop_gradient import recording, replaying, stop_gradient
 from reference_numpy.transforms import exponential_bins
 from reference_numpy.world_model import continue_target, world_model_losses
@@ -44,8 +44,8 @@ Params = Mapping[str, Any]
 
 
 def initial_parameters(table: Mapping[str, Parameter], uniforms: Mapping[str, Any]) -> dict[str, Array]:
-    """Fresh parameters as a function of uniform numbers. Implements [AGT-3] to [AGT-6], [LAY-9]; paper: Critic
-    learning.
+    """Fresh parameters as a function of uniform numbers.
+    Implements [AGT-3] to [AGT-6], [LAY-9]; paper: Critic learning.
 
     Args:
       table: name -> Parameter, from `spec.parameters.parameter_table`.
@@ -55,14 +55,12 @@ def initial_parameters(table: Mapping[str, Parameter], uniforms: Mapping[str, An
     Raises:
       ValueError: a name is missing or too many, or a shape differs.
     """
-    _same_names(
-        "uniforms", uniforms, {name for name, entry in table.items() if entry.initializer == "truncated_normal"}
-    )
+    kernels = {name: entry.shape for name, entry in table.items() if entry.initializer == "truncated_normal"}
+    require_shapes("uniforms", uniforms, kernels)
     params = {}
     for name, entry in table.items():
         if entry.initializer == "truncated_normal":
-            uniform = checked(f"uniforms[{name!r}]", uniforms[name], *entry.shape)
-            params[name] = truncated_normal(uniform, entry.fan_in, entry.outscale)
+            params[name] = truncated_normal(uniforms[name], entry.fan_in, entry.outscale)
         else:
             params[name] = np.full(entry.shape, {"zeros": 0.0, "ones": 1.0}[entry.initializer])
     return params
@@ -120,9 +118,7 @@ def unflatten_state(arrays: Mapping[str, Any], table: Mapping[str, Parameter]) -
     """
     zeros = initial_state({name: np.zeros(entry.shape) for name, entry in table.items()})
     expected = {name: value.shape for name, value in flatten_state(zeros).items()}
-    _same_names("checkpoint", arrays, expected)
-    for name, shape in expected.items():
-        require_shape(f"checkpoint[{name!r}]", np.shape(arrays[name]), *shape)
+    require_shapes("training state", arrays, expected)
 
     def group(prefix: str) -> dict[str, Array]:
         return {
@@ -154,8 +150,8 @@ def policy_step(
     config: Config,
     mode: bool = False,
 ) -> tuple[dict[str, Array], Array]:
-    """One observation of each row in, one action of each row out. Implements [AGT-11] to [AGT-13], [LOOP-71]; paper:
-    Critic learning.
+    """One observation of each row in, one action of each row out.
+    Implements [AGT-11] to [AGT-13], [LOOP-71]; paper: Critic learning.
 
     Args:
       carry: {"deter" [N, D], "stoch" [N, S, C]}.
@@ -177,9 +173,9 @@ def policy_step(
     tokens = networks.encoder(params, observation, spaces, config)
     carry, _ = observe_step(params, carry, tokens, prev_action, is_first, noise["posterior"], config)
     outputs = networks.actor(params, networks.feature(carry["deter"], carry["stoch"]), spaces, config)
-    return dict(carry), mode_action(outputs, spaces, config) if mode else sample_action(
-        outputs, noise["action"], spaces, config
-    )
+    if mode:
+        return dict(carry), mode_action(outputs, spaces, config)
+    return dict(carry), sample_action(outputs, noise["action"], spaces, config)
 
 
 def losses(
@@ -201,8 +197,8 @@ def losses(
       noise: {"posterior" [B, T, S], "prior" [N, H, S], "action" [N, H, K]} with N = B*T.
 
     Returns:
-      The total, and aux: "losses" (name -> mean), "return_range" (low, high), "deter" [B, T, D], "stoch" [B, T, S, C],
-        "metrics".
+      The total, and aux: "losses" {name: mean}, "return_range" (low, high), "deter" [B, T, D], "stoch" [B, T, S, C],
+      "metrics" {name: scalar}.
 
     Raises:
       ValueError: an array of the batch or the noise has another shape.
@@ -327,8 +323,8 @@ def train_step(
 def directional_derivative(
     function: Callable[[dict[str, Array]], Any], params: Params, direction: Params, step: float
 ) -> Any:
-    """The derivative of `function` at `params` along `direction`, stop-gradients held constant. Implements [AGT-32],
-    [CON-14].
+    """The derivative of `function` at `params` along `direction`, stop-gradients held constant.
+    Implements [AGT-32], [CON-14].
 
     Args:
       function: params -> scalar or array; must call `stop_gradient` equally often at every point.
@@ -338,8 +334,7 @@ def directional_derivative(
     Raises:
       ValueError: the direction has unknown names or shapes, or the step is not positive.
     """
-    if not step > 0:
-        raise ValueError(f"step: expected a positive number, got {step}")
+    require(step > 0, "step", "a positive number", step)
     for name, value in direction.items():
         if name not in params:
             raise ValueError(f"direction: unknown parameter {name!r}")
@@ -366,36 +361,24 @@ def _loss_scale(name: str, config: Config) -> float:
 
 
 def _check_batch(batch: Mapping[str, Any], spaces: Spaces, config: Config) -> None:
-    entries = ("reward", "is_first", "is_last", "is_terminal", "prev_action", "deter", "stoch", *spaces.observations)
-    missing = [name for name in entries if name not in batch]
-    if missing:
-        raise ValueError(f"batch lacks {', '.join(missing)}")
+    flags = ("reward", "is_first", "is_last", "is_terminal")
+    require_keys("batch", batch, (*spaces.observations, *flags, "prev_action", "deter", "stoch"))
     require_shape("batch['reward']", np.shape(batch["reward"]), "B", "T")
     rows, length = np.shape(batch["reward"])
-    for name in ("is_first", "is_last", "is_terminal"):
-        require_shape(f"batch[{name!r}]", np.shape(batch[name]), rows, length)
+    require_observations("batch", batch, spaces, (rows, length))
+    for key in flags:
+        require_shape(f"batch[{key!r}]", np.shape(batch[key]), rows, length)
     require_shape("batch['prev_action']", np.shape(batch["prev_action"]), rows, length, spaces.action_size)
     require_shape("batch['deter']", np.shape(batch["deter"]), rows, config.deter)
     require_shape("batch['stoch']", np.shape(batch["stoch"]), rows, config.stoch)
     indices = np.asarray(batch["stoch"])
-    if indices.dtype.kind not in "iu" or indices.min() < 0 or indices.max() >= config.classes:
-        raise ValueError(
-            f"batch['stoch']: expected class indices in 0 .. {config.classes - 1}, got {indices.dtype} {indices!r}"
-        )
-    for key, space in spaces.observations.items():
-        require_shape(f"batch[{key!r}]", np.shape(batch[key]), rows, length, *space.array_shape)
+    valid = indices.dtype.kind in "iu" and indices.min() >= 0 and indices.max() < config.classes
+    require(valid, "batch['stoch']", f"class indices in 0 .. {config.classes - 1}", f"{indices.dtype} {indices!r}")
 
 
 def _check_noise(noise: Mapping[str, Any], rows: int, length: int, spaces: Spaces, config: Config) -> None:
+    require_keys("noise", noise, ("posterior", "prior", "action"))
     starts, horizon = rows * length, config.imagination_horizon
     require_shape("noise['posterior']", np.shape(noise["posterior"]), rows, length, config.stoch)
     require_shape("noise['prior']", np.shape(noise["prior"]), starts, horizon, config.stoch)
     require_shape("noise['action']", np.shape(noise["action"]), starts, horizon, spaces.action_noise_size)
-
-
-def _same_names(what: str, given: Any, expected: Any) -> None:
-    missing, unknown = sorted(set(expected) - set(given)), sorted(set(given) - set(expected))
-    if missing or unknown:
-        raise ValueError(
-            f"{what}: missing {missing[:5]}, unknown {unknown[:5]} ({len(missing)} missing, {len(unknown)} unknown)"
-        )

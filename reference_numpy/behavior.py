@@ -18,7 +18,7 @@ from reference_numpy.distributions import (
     symexp_twohot_mean,
     unimix_log_probs,
 )
-from reference_numpy.shapes import checked
+from reference_numpy.shapes import checked, require_keys, require_shapes
 from reference_numpy.stop_gradient import stop_gradient
 from reference_numpy.transforms import exponential_bins
 from spec.config import Config
@@ -29,8 +29,8 @@ Outputs = Mapping[str, Mapping[str, Any]]
 
 
 def sample_action(outputs: Outputs, noise: Any, spaces: Spaces, config: Config) -> Array:
-    """A flat action from the actor's raw outputs, a constant. Implements [BEH-1] to [BEH-5], [BEH-8], [BEH-22],
-    [BEH-23].
+    """A flat action from the actor's raw outputs, a constant.
+    Implements [BEH-1] to [BEH-5], [BEH-8], [BEH-22], [BEH-23].
 
     Paper: section Critic learning, the actor; D-22, D-66, D-67, D-70.
 
@@ -68,8 +68,8 @@ def mode_action(outputs: Outputs, spaces: Spaces, config: Config) -> Array:
       outputs: as in `sample_action`.
 
     Returns:
-      [..., A]: one-hot at the most probable class, the first of equals, for every entry of a Discrete; the mean for a
-      Vector.
+      [..., A]: for a Vector the mean; for every entry of a Discrete one-hot at the most probable class, the first of
+      equals.
 
     Raises:
       ValueError: wrong keys or shapes.
@@ -144,8 +144,8 @@ def action_entropy(outputs: Outputs, spaces: Spaces, config: Config) -> Array:
 
 
 def actor_loss(log_prob: Any, entropy: Any, returns: Any, value: Any, weight: Any, scale: Any, config: Config) -> Array:
-    """The Reinforce loss with entropy regularizer. Implements [BEH-9] to [BEH-11], [BEH-17], [BEH-18], [BEH-22] to
-    [BEH-24].
+    """The Reinforce loss with entropy regularizer.
+    Implements [BEH-9] to [BEH-11], [BEH-17], [BEH-18], [BEH-22] to [BEH-24].
 
     Paper: section Actor learning, the loss with its sign mended; D-09, D-60, D-61.
 
@@ -177,8 +177,8 @@ def critic_loss(logits: Any, slow_logits: Any, returns: Any, weight: Any, config
     Paper: section Critic learning; D-09, D-51, D-53.
 
     Args:
-      logits, slow_logits: [N, H, bins], critic and slow critic at the same states; the gradient passes through logits
-        only.
+      logits, slow_logits: [N, H, bins], critic and slow critic at the same states; the gradient passes through the
+        first only.
       returns: [N, H], units of reward.
       weight: [N, H].
 
@@ -201,7 +201,7 @@ def replay_critic_loss(logits: Any, slow_logits: Any, returns: Any, is_last: Any
 
     Args:
       logits, slow_logits: [B, T-1, bins], critic and slow critic at the posterior states 0 .. T-2; the gradient passes
-        through logits.
+        through the first only.
       returns: [B, T-1], units of reward, of `replay_lambda_return`.
       is_last: [B, T-1], flags of the same steps, booleans or 0 and 1.
 
@@ -231,16 +231,10 @@ def update_slow_critic(slow: Mapping[str, Any], critic: Mapping[str, Any], decay
     Raises:
       ValueError: names or shapes do not match.
     """
-    expected = {name for name in critic if name.startswith("critic/")}
-    if set(slow) != expected:
-        missing, unknown = sorted(expected - set(slow)), sorted(set(slow) - expected)
-        raise ValueError(
-            f"slow must have exactly the critic/ names of critic; missing: {missing}, not in critic: {unknown}"
-        )
+    require_shapes("slow", slow, {name: np.shape(x) for name, x in critic.items() if name.startswith("critic/")})
     updated: dict[str, Array] = {}
     for name in slow:
-        new = np.asarray(critic[name], dtype=np.float64)
-        old = checked(f"slow[{name!r}]", slow[name], *new.shape)
+        old, new = np.asarray(slow[name], dtype=np.float64), np.asarray(critic[name], dtype=np.float64)
         updated[name] = decay * old + (1 - decay) * new
     return updated
 
@@ -248,8 +242,7 @@ def update_slow_critic(slow: Mapping[str, Any], critic: Mapping[str, Any], decay
 def _regularized_value_loss(
     logits: Any, slow_logits: Any, returns: Any, shape: tuple[int, ...], config: Config
 ) -> Array:
-    """[rows, steps]: cross entropy towards the return plus cross entropy towards the slow critic's mean, both targets
-    constant."""
+    """[rows, steps]: cross entropy towards the return and towards the slow critic's mean, both targets constant."""
     logits = checked("logits", logits, *shape, config.bins)
     slow_logits = checked("slow_logits", slow_logits, *shape, config.bins)
     returns = checked("returns", returns, *shape)
@@ -262,14 +255,12 @@ def _regularized_value_loss(
 
 def _checked_outputs(outputs: Outputs, spaces: Spaces, config: Config) -> dict[str, dict[str, Array]]:
     """The outputs in float64, their keys and shapes checked; all share their leading axes."""
-    if set(outputs) != set(spaces.actions):
-        raise ValueError(f"outputs must have the action keys {sorted(spaces.actions)}, got {sorted(outputs)}")
+    require_keys("outputs", outputs, spaces.actions, exactly=True)
     leading: tuple[int, ...] | None = None
     converted: dict[str, dict[str, Array]] = {}
     for key, space in spaces.actions.items():
         names = ("logits",) if isinstance(space, Discrete) else ("mean", "std")
-        if set(outputs[key]) != set(names):
-            raise ValueError(f"outputs[{key!r}] must hold {sorted(names)}, got {sorted(outputs[key])}")
+        require_keys(f"outputs[{key!r}]", outputs[key], names, exactly=True)
         converted[key] = {}
         for name in names:
             axes = (...,) if leading is None else leading
@@ -290,8 +281,7 @@ def _normal(outputs: Mapping[str, Array], config: Config) -> tuple[Array, Array]
 
 
 def _categoricals(logits: Array, space: Discrete, config: Config) -> Iterator[tuple[Array, slice]]:
-    """For each entry of `classes` its mixed log-probabilities and its place in the logits and in the flat action of the
-    key."""
+    """For each entry of `classes` its mixed log-probabilities, and its place in the logits and in the flat action."""
     start = 0
     for classes in space.classes:
         segment = slice(start, start + classes)

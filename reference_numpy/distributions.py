@@ -1,5 +1,4 @@
-"""The distributions that network outputs stand for: log-probabilities, samples, losses. Chapter:
-spec/02-distributions.md."""
+"""What the networks' outputs stand for: log-probabilities, samples, losses. Chapter: spec/02-distributions.md."""
 
 from typing import Any
 
@@ -14,8 +13,8 @@ Array = NDArray[np.float64]
 
 
 def unimix_log_probs(logits: Any, unimix: float) -> Array:
-    """Log-probabilities of a softmax mixed with the uniform distribution. Implements [DIS-1], [DIS-3], [DIS-5],
-    [DIS-6], [DIS-7].
+    """Log-probabilities of a softmax mixed with the uniform distribution.
+    Implements [DIS-1], [DIS-3], [DIS-5] to [DIS-7].
 
     Paper: section World model learning (1 % uniform) and section Distributions; D-21 to D-23.
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from reference_numpy.shapes import checked
+from reference_numpy.shapes import checked, require
 
 Array = NDArray[np.float64]
 Params = Mapping[str, Any]
@@ -118,8 +118,7 @@ def convolution(x: Any, kernel: Any, bias: Any, stride: int) -> Array:
     Raises:
       ValueError: a shape or the stride does not fit, or a side is odd at stride 2.
     """
-    if stride not in (1, 2):
-        raise ValueError(f"stride: expected 1 or 2, got {stride}")
+    require(stride in (1, 2), "stride", "1 or 2", stride)
     x, kernel, bias = _image_kernel_bias(x, kernel, bias)
     if stride == 2:
         _require_even_sides(x)
@@ -236,8 +235,7 @@ def mlp(params: Params, name: str, x: Any, layers: int, epsilon: float) -> Array
       ValueError: a shape does not fit, or no layer.
       KeyError: a parameter is missing.
     """
-    if layers < 1:
-        raise ValueError(f"layers: expected at least 1, got {layers}")
+    require(layers >= 1, "layers", "at least 1", layers)
     for layer in range(layers):
         x = dense(params, f"{name}/hidden{layer}", x, epsilon)
     return x
@@ -259,8 +257,7 @@ def truncated_normal(uniform: Any, fan_in: int, outscale: float) -> Array:
     Raises:
       ValueError: fan_in is below 1.
     """
-    if fan_in < 1:
-        raise ValueError(f"fan_in: expected at least 1, got {fan_in}")
+    require(fan_in >= 1, "fan_in", "at least 1", fan_in)
     uniform = np.asarray(uniform, dtype=np.float64)
     standard = NormalDist()
     lowest, highest = standard.cdf(-2.0), standard.cdf(2.0)
@@ -275,6 +272,4 @@ def _image_kernel_bias(x: Any, kernel: Any, bias: Any) -> tuple[Array, Array, Ar
 
 
 def _require_even_sides(x: Array) -> None:
-    height, width = x.shape[-3:-1]
-    if height % 2 or width % 2:
-        raise ValueError(f"x: expected even height and width, got {height}x{width}")
+    require(not (x.shape[-3] % 2 or x.shape[-2] % 2), "x", "an even height and width", list(x.shape))

@@ -20,7 +20,7 @@ from reference_numpy.layers import (
     upsample,
 )
 from reference_numpy.observations import one_hots, scaled_image
-from reference_numpy.shapes import checked, require_shape
+from reference_numpy.shapes import checked, require_observations
 from reference_numpy.transforms import symlog
 from spec.config import Config
 from spec.parameters import bottleneck
@@ -64,7 +64,7 @@ def encoder(params: Params, observations: Mapping[str, Any], spaces: Spaces, con
       ValueError: a key is missing, a shape or dtype does not fit, a Discrete value is out of range, or an image cannot
         be halved.
     """
-    rows = _leading_axes(observations, spaces)
+    rows = require_observations("observations", observations, spaces)
     if spaces.images:
         bottleneck(config, spaces)  # raises if the sides cannot be halved as often as configured
     tokens = []
@@ -74,7 +74,7 @@ def encoder(params: Params, observations: Mapping[str, Any], spaces: Spaces, con
             mlp(params, "encoder/vector", np.concatenate(inputs, axis=-1), config.encoder_layers, config.norm_epsilon)
         )
     if spaces.images:
-        images = [scaled_image(key, observations[key]) - 0.5 for key in spaces.images]
+        images = [scaled_image(observations[key]) - 0.5 for key in spaces.images]
         picture = np.concatenate(images, axis=-1)
         tokens.append(_encode_image(params, picture.reshape(-1, *picture.shape[-3:]), config).reshape(*rows, -1))
     return np.concatenate(tokens, axis=-1)
@@ -242,16 +242,3 @@ def _head(params: Params, name: str, feature: Any, layers: int, config: Config) 
     feature = checked("feature", feature, ..., config.feature_size)
     hidden = mlp(params, name, feature, layers, config.norm_epsilon)
     return linear(hidden, params[f"{name}/out/kernel"], params[f"{name}/out/bias"])
-
-
-def _leading_axes(observations: Mapping[str, Any], spaces: Spaces) -> tuple[int, ...]:
-    """The axes before those of one observation, the same for every key."""
-    rows: tuple[int, ...] | None = None
-    for key, space in spaces.observations.items():
-        if key not in observations:
-            raise ValueError(f"observation {key!r} is missing; got the keys {sorted(observations)}")
-        shape = np.shape(observations[key])
-        require_shape(f"observation {key!r}", shape, *((...,) if rows is None else rows), *space.array_shape)
-        rows = shape[: len(shape) - len(space.array_shape)]
-    assert rows is not None
-    return rows

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from reference_numpy.shapes import checked
+from reference_numpy.shapes import checked, require, require_shapes
 from spec.config import Config
 
 Array = NDArray[np.float64]
@@ -16,8 +16,8 @@ DEAD_ZONE = 1e-16  # [OPT-9]: below this the square of a gradient would leave th
 
 
 def adaptive_gradient_clip(gradient: Any, parameter: Any, clip: float, epsilon: float) -> Array:
-    """The gradient of one tensor, shortened where it is too long for the tensor. Implements [OPT-1] to [OPT-5],
-    [OPT-19].
+    """The gradient of one tensor, shortened where it is too long for the tensor.
+    Implements [OPT-1] to [OPT-5], [OPT-19].
 
     Paper: Methods, Implementation, paragraph Optimizer; D-74.
 
@@ -115,29 +115,20 @@ def optimizer_step(
     Raises:
       ValueError: names or shapes do not match.
     """
-    for label, mapping in (
-        ("gradients", gradients),
-        ("second_moment", state["second_moment"]),
-        ("momentum", state["momentum"]),
-    ):
-        if set(mapping) != set(params):
-            missing, unknown = sorted(set(params) - set(mapping)), sorted(set(mapping) - set(params))
-            raise ValueError(
-                f"{label} must have exactly the names of params; missing: {missing}, not in params: {unknown}"
-            )
+    shapes = {name: np.shape(value) for name, value in params.items()}
+    require_shapes("gradients", gradients, shapes)
+    require_shapes("second_moment", state["second_moment"], shapes)
+    require_shapes("momentum", state["momentum"], shapes)
     step = int(state["step"])
     rate = learning_rate(step, config)
     new_params: dict[str, Array] = {}
     second_moments: dict[str, Array] = {}
     momenta: dict[str, Array] = {}
     for name in params:
-        try:
-            clipped = adaptive_gradient_clip(gradients[name], params[name], config.agc_clip, config.agc_epsilon)
-            update, second_moments[name], momenta[name] = laprop(
-                clipped, state["second_moment"][name], state["momentum"][name], step, config
-            )
-        except ValueError as error:
-            raise ValueError(f"parameter {name!r}: {error}") from error
+        clipped = adaptive_gradient_clip(gradients[name], params[name], config.agc_clip, config.agc_epsilon)
+        update, second_moments[name], momenta[name] = laprop(
+            clipped, state["second_moment"][name], state["momentum"][name], step, config
+        )
         new_params[name] = np.asarray(params[name], dtype=np.float64) - rate * update
     return new_params, {"step": step + 1, "second_moment": second_moments, "momentum": momenta}
 
@@ -153,5 +144,4 @@ def _norm(tensor: Array) -> float:
 
 
 def _require_step(step: int) -> None:
-    if step < 0:
-        raise ValueError(f"step: expected the number of updates made before, 0 or more, got {step}")
+    require(step >= 0, "step", "the number of updates made before, 0 or more", step)

@@ -58,8 +58,7 @@ class Replay:
         self._streams: dict[int, _Stream] = {}
         self._next_stream = 0
         self._current: dict[int, int] = {}  # worker -> number of the stream it writes to
-        # A ring: item number i, counted from the oldest, is at (oldest + i) % len. It grows until it holds `capacity`
-        # items.
+        # A ring: item i, counted from the oldest, is at (oldest + i) % len. It grows until it holds `capacity` items.
         self._items: list[tuple[int, int]] = []
         self._oldest = 0
         self._queue: collections.deque[tuple[int, int]] = collections.deque()
@@ -71,8 +70,8 @@ class Replay:
         return len(self._items)
 
     def add(self, step: Mapping[str, Any], worker: int) -> None:
-        """Appends one record to the stream of a worker. Implements [REP-1], [REP-2], [REP-4] to [REP-7], [REP-27],
-        [REP-28].
+        """Appends one record to the stream of a worker.
+        Implements [REP-1], [REP-2], [REP-4] to [REP-7], [REP-27], [REP-28].
 
         Args:
           step: observations, reward, is_first, is_last, is_terminal, action [A], deter [D], stoch [S]; copied.
@@ -171,8 +170,8 @@ class Replay:
         return state
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Replaces the content by a saved one; all streams are closed, the queue is empty. Implements [REP-24] to
-        [REP-26].
+        """Replaces the content by a saved one; all streams are closed, the queue is empty.
+        Implements [REP-24] to [REP-26].
 
         Raises:
           ValueError: the state was saved with another length.
@@ -231,8 +230,7 @@ class Replay:
         self._oldest = (self._oldest + 1) % self.capacity
 
     def _evict(self, number: int, start: int) -> None:
-        """A stream's items leave in the order of their starts, so exactly the record at the start is no longer
-        needed."""
+        """A stream's items leave in the order of their starts, so the record at the start is no longer needed."""
         stream = self._streams[number]
         del stream.records[start]
         stream.first = start + 1

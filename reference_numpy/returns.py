@@ -1,5 +1,7 @@
-"""λ-returns, cumulative weights and the return range: plain arithmetic, every result is a constant. Chapter:
-spec/07-returns.md."""
+"""λ-returns, cumulative weights and the return range. Chapter: spec/07-returns.md.
+
+Plain arithmetic; every result is a constant.
+"""
 
 import math
 from typing import Any
@@ -7,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from reference_numpy.shapes import checked
+from reference_numpy.shapes import checked, require
 from spec.config import Config
 
 Array = NDArray[np.float64]
@@ -72,8 +74,7 @@ def replay_lambda_return(
     returns = np.zeros((len(reward), last))
     later = annotation[:, last]
     for t in reversed(range(last)):
-        # Where the arrival step ends an episode only its annotation counts: what follows in the sequence is another
-        # episode.
+        # Where the arrival step ends an episode only its annotation counts: what follows belongs to another episode.
         mix = lambda_ * (1 - is_last[:, t + 1])
         future = (1 - mix) * annotation[:, t + 1] + mix * later
         later = reward[:, t + 1] + discount * (1 - is_terminal[:, t + 1]) * future
@@ -97,8 +98,7 @@ def cumulative_weights(continue_: Any, discount: float) -> Array:
       ValueError: a shape other than [N, H+1] with at least one transition, or a discount not above 0 and at most 1.
     """
     continue_ = _steps("continue_", continue_, at_least=2)
-    if not 0 < discount <= 1:
-        raise ValueError(f"discount: expected a number above 0 and at most 1, got {discount}")
+    require(0 < discount <= 1, "discount", "above 0 and at most 1", discount)
     horizon = continue_.shape[1] - 1
     weights = np.zeros((len(continue_), horizon))
     product = np.ones(len(continue_))
@@ -124,10 +124,8 @@ def percentile(values: Any, q: float) -> float:
       ValueError: no values, or a q outside 0 to 100.
     """
     flat = np.sort(np.asarray(values, dtype=np.float64).reshape(-1))
-    if len(flat) == 0:
-        raise ValueError("values: expected at least one value, got none")
-    if not 0 <= q <= 100:
-        raise ValueError(f"q: expected a percentage between 0 and 100, got {q}")
+    require(len(flat) > 0, "values", "at least one value", "none")
+    require(0 <= q <= 100, "q", "0 to 100", q)
     if np.isnan(flat).any():
         return math.nan
     position = q / 100 * (len(flat) - 1)
@@ -139,8 +137,8 @@ def percentile(values: Any, q: float) -> float:
 
 
 def update_return_range(low: Any, high: Any, returns: Any, config: Config) -> tuple[float, float]:
-    """The averaged percentiles after the imagined returns of this step. Implements [RET-14], [RET-15], [RET-17] to
-    [RET-19].
+    """The averaged percentiles after the imagined returns of this step.
+    Implements [RET-14], [RET-15], [RET-17] to [RET-19].
 
     Paper: section Actor learning, equation of S; D-59, D-63, D-64.
 
@@ -181,9 +179,7 @@ def return_scale(low: Any, high: Any, limit: float) -> float:
 
 
 def _steps(name: str, value: Any, at_least: int) -> Array:
-    array = checked(name, value, "rows", "steps")
-    if array.shape[1] < at_least:
-        raise ValueError(
-            f"{name}: expected shape [rows, steps] with at least {at_least} steps, got {list(array.shape)}"
-        )
+    array = np.asarray(value, dtype=np.float64)
+    fits = array.ndim == 2 and array.shape[1] >= at_least
+    require(fits, name, f"shape [rows, steps] with at least {at_least} steps", list(array.shape))
     return array

@@ -1,5 +1,4 @@
-"""The recurrent state-space model: memory update, prior, posterior, observing a sequence, imagining. Chapter:
-spec/04-rssm.md."""
+"""The recurrent state-space model: memory update, prior, posterior, observing, imagining. Chapter: spec/04-rssm.md."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -134,8 +133,8 @@ def observe_step(
     is_first = np.asarray(is_first, dtype=bool)
     require_shape("is_first", is_first.shape, "N")
     rows = len(is_first)
-    deter = checked("carry deter", carry["deter"], rows, config.deter)
-    stoch = checked("carry stoch", carry["stoch"], rows, config.stoch, config.classes)
+    deter = checked("carry['deter']", carry["deter"], rows, config.deter)
+    stoch = checked("carry['stoch']", carry["stoch"], rows, config.stoch, config.classes)
     prev_action = checked("prev_action", prev_action, rows, _action_size(params))
     uniform = checked("uniform", uniform, rows, config.stoch)
 
@@ -153,8 +152,8 @@ def observe_step(
 def observe(
     params: Params, carry: Carry, tokens: Any, prev_action: Any, is_first: Any, uniform: Any, config: Config
 ) -> dict[str, Array]:
-    """A sequence of observations, with resets wherever an episode starts. Implements [RSSM-17] to [RSSM-19], [RSSM-23],
-    [RSSM-27].
+    """A sequence of observations, with resets wherever an episode starts.
+    Implements [RSSM-17] to [RSSM-19], [RSSM-23], [RSSM-27].
 
     Paper: World model learning; D-20, D-85, D-86.
 
@@ -179,8 +178,8 @@ def observe(
     tokens = checked("tokens", tokens, rows, steps, _token_size(params, config))
     prev_action = checked("prev_action", prev_action, rows, steps, _action_size(params))
     uniform = checked("uniform", uniform, rows, steps, config.stoch)
-    require_shape("carry deter", np.shape(carry["deter"]), rows, config.deter)
-    require_shape("carry stoch", np.shape(carry["stoch"]), rows, config.stoch, config.classes)
+    require_shape("carry['deter']", np.shape(carry["deter"]), rows, config.deter)
+    require_shape("carry['stoch']", np.shape(carry["stoch"]), rows, config.stoch, config.classes)
 
     state = {name: stop_gradient(np.asarray(carry[name], dtype=np.float64)) for name in ("deter", "stoch")}
     outputs: dict[str, list[Array]] = {"deter": [], "stoch": [], "logits": []}
@@ -215,13 +214,11 @@ def imagine(
     """
     uniform = checked("uniform", uniform, "N", "H", config.stoch)
     rows, horizon, _ = uniform.shape
-    deter = stop_gradient(checked("carry deter", carry["deter"], rows, config.deter))
-    stoch = stop_gradient(checked("carry stoch", carry["stoch"], rows, config.stoch, config.classes))
+    deter = stop_gradient(checked("carry['deter']", carry["deter"], rows, config.deter))
+    stoch = stop_gradient(checked("carry['stoch']", carry["stoch"], rows, config.stoch, config.classes))
     deters, stochs, actions = [deter], [stoch], []
     for t in range(horizon):
-        action = stop_gradient(
-            checked("action of the policy", policy(feature(deter, stoch), t), rows, _action_size(params))
-        )
+        action = stop_gradient(checked("action", policy(feature(deter, stoch), t), rows, _action_size(params)))
         deter = stop_gradient(core(params, deter, stoch, action, config))
         log_probs = unimix_log_probs(prior(params, deter, config), config.latent_unimix)
         stoch = categorical_sample(log_probs, uniform[:, t])

@@ -71,8 +71,8 @@ def stop_gradient(x: Any) -> Array:
 
 @contextmanager
 def recording() -> Iterator[Tape]:
-    """A context in which stop_gradient also writes a copy of each value to the tape, in order. Implements [CON-14],
-    [DIS-2].
+    """A context in which stop_gradient also writes a copy of each value to the tape, in order.
+    Implements [CON-14], [DIS-2].
 
     Raises:
       ValueError: inside another recording or replay.

@@ -1,7 +1,7 @@
 """What a training loop must decide exactly: when to train, what to store, what the environment gets, and every seed.
 
-Chapter: spec/12-training-loop.md. Paper: section Implementation, Experience replay; section Critic learning (action
-sampling).
+Chapter: spec/12-training-loop.md. Paper: sections Implementation (Experience replay) and Critic learning (sampling of
+actions).
 """
 
 import hashlib
@@ -157,8 +157,7 @@ def environment_action(
 
 
 def _rescale(part: NDArray[Any], low: NDArray[Any], high: NDArray[Any]) -> NDArray[Any]:
-    """[-1, 1] to the range of each dimension: between its bounds, 2 wide at the only one, or as it is where there is
-    none."""
+    """[-1, 1] to the range of each dimension: between its bounds, 2 wide at the only one, as it is without any."""
     clipped = np.clip(part, -1.0, 1.0)
     below, above = np.isfinite(low), np.isfinite(high)
     with np.errstate(invalid="ignore"):  # Not taken where it is infinite.

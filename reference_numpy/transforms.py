@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from reference_numpy.shapes import checked
+from reference_numpy.shapes import checked, require
 
 Array = NDArray[np.float64]
 
@@ -55,8 +55,7 @@ def exponential_bins(bins: int) -> Array:
     Raises:
       ValueError: an even number of bins, or less than 3.
     """
-    if bins < 3 or bins % 2 == 0:
-        raise ValueError(f"bins: expected an odd number of at least 3, got {bins}")
+    require(bins % 2 == 1 and bins >= 3, "bins", "an odd number of at least 3", bins)
     centre = (bins - 1) // 2
     positive = symexp(20.0 * np.arange(1, centre + 1) / centre)
     return np.concatenate([-positive[::-1], [0.0], positive])
@@ -64,7 +63,7 @@ def exponential_bins(bins: int) -> Array:
 
 def twohot(x: Any, bins: Any) -> Array:
     """Weights of the two bins around each number, so that their mean is the number.
-    Implements [TRA-7], [TRA-8], [TRA-9], [TRA-13], [TRA-14].
+    Implements [TRA-7] to [TRA-9], [TRA-13], [TRA-14].
 
     Paper: eq. twohot, section Distributions; D-45, D-46.
 
@@ -81,8 +80,7 @@ def twohot(x: Any, bins: Any) -> Array:
     """
     x = np.asarray(x, dtype=np.float64)
     bins = checked("bins", bins, "K")
-    if len(bins) < 2:
-        raise ValueError(f"bins: expected at least 2, got {len(bins)}")
+    require(len(bins) >= 2, "bins", "at least 2 bins", len(bins))
     weights = np.zeros((*x.shape, len(bins)))
     for index in np.ndindex(x.shape):
         number = x[index]
@@ -102,7 +100,7 @@ def twohot(x: Any, bins: Any) -> Array:
 
 def ordered_expectation(probs: Any, bins: Any) -> Array:
     """Mean of a distribution over symmetric bins, exactly 0 for symmetric probabilities.
-    Implements [TRA-10], [TRA-11], [TRA-12], [TRA-13], [TRA-14].
+    Implements [TRA-10] to [TRA-14].
 
     Paper: section Distributions (the order of summation); D-47.
 
@@ -114,14 +112,12 @@ def ordered_expectation(probs: Any, bins: Any) -> Array:
       [...]: sum of probs * bins over the last axis, taken over mirrored pairs from small to large.
 
     Raises:
-      ValueError: bins is not one-dimensional, has an even number, fewer than 3, or is not symmetric; probs has another
-        last axis.
+      ValueError: bins that are not one-dimensional, an even number, fewer than 3 or not symmetric; another last axis of
+        probs.
     """
     bins = checked("bins", bins, "K")
-    if len(bins) < 3 or len(bins) % 2 == 0:
-        raise ValueError(f"bins: expected an odd number of at least 3, got {len(bins)}")
-    if not np.array_equal(bins, -bins[::-1]):
-        raise ValueError("bins: expected each bin to be the negative of its mirror image")
+    require(len(bins) % 2 == 1 and len(bins) >= 3, "bins", "an odd number of at least 3", len(bins))
+    require(np.array_equal(bins, -bins[::-1]), "bins", "each bin the negative of its mirror image", bins.tolist())
     probs = checked("probs", probs, ..., len(bins))
     centre = len(bins) // 2
     total = np.zeros(probs.shape[:-1])

@@ -20,7 +20,7 @@ from reference_numpy.distributions import (
     unimix_log_probs,
 )
 from reference_numpy.observations import one_hots, scaled_image
-from reference_numpy.shapes import checked, require_shape
+from reference_numpy.shapes import checked, require, require_keys, require_observations, require_shape
 from reference_numpy.stop_gradient import stop_gradient
 from reference_numpy.transforms import exponential_bins, symexp
 from spec.config import Config
@@ -86,24 +86,20 @@ def reconstruction_losses(
     Raises:
       ValueError: a key is missing, or a shape, dtype or Discrete value does not fit.
     """
+    require_keys("predictions", predictions, spaces.observations)
+    rows = require_observations("observations", observations, spaces)
     losses = {}
     for key, space in spaces.observations.items():
-        for name, mapping in (("predictions", predictions), ("observations", observations)):
-            if key not in mapping:
-                raise ValueError(f"{name}: the key {key!r} is missing; got {sorted(mapping)}")
-        name = f"prediction of {key!r}"
+        size = space.array_shape if isinstance(space, Image) else (space.encoded_size,)
+        prediction = checked(f"predictions[{key!r}]", predictions[key], *rows, *size)
         if isinstance(space, Image):
-            target = scaled_image(key, observations[key])
-            prediction = checked(name, predictions[key], ..., *space.array_shape)
-            require_shape(f"observation {key!r}", target.shape, *prediction.shape)
+            target = scaled_image(observations[key])
             losses[key] = mse_loss(prediction, target).sum(axis=(-3, -2, -1))
         elif isinstance(space, Discrete):
             target = one_hots(key, observations[key], space)
-            logits = checked(name, predictions[key], *target.shape)
-            losses[key] = _cross_entropy(logits, target, space)
+            losses[key] = _cross_entropy(prediction, target, space)
         else:
-            target = checked(f"observation {key!r}", observations[key], ..., space.size)
-            prediction = checked(name, predictions[key], *target.shape)
+            target = np.asarray(observations[key], dtype=np.float64)
             losses[key] = symlog_mse_loss(prediction, target, config.vector_loss_scale).sum(axis=-1)
     return losses
 
@@ -123,23 +119,21 @@ def world_model_losses(
       states: "deter" [B, T, D], "stoch" [B, T, S, C] and "logits" [B, T, S, C], as `rssm.observe` returns them.
 
     Returns:
-      "reconstruction/{key}" for every observation key, "reward", "continue", "dynamics" and "representation", each [B,
-      T].
+      {name: [B, T]}: "reconstruction/{key}" for every observation key, "reward", "continue", "dynamics" and
+      "representation".
 
     Raises:
       ValueError: a key is missing, or a shape, dtype or Discrete value does not fit.
     """
-    deter = checked("states deter", states["deter"], "B", "T", config.deter)
+    require_keys("batch", batch, (*spaces.observations, "reward", "is_terminal"))
+    require_keys("states", states, ("deter", "stoch", "logits"))
+    deter = checked("states['deter']", states["deter"], "B", "T", config.deter)
     rows = deter.shape[:-1]
-    stoch = checked("states stoch", states["stoch"], *rows, config.stoch, config.classes)
-    require_shape("states logits", np.shape(states["logits"]), *rows, config.stoch, config.classes)
+    stoch = checked("states['stoch']", states["stoch"], *rows, config.stoch, config.classes)
+    require_shape("states['logits']", np.shape(states["logits"]), *rows, config.stoch, config.classes)
     for key in ("reward", "is_terminal"):
-        if key not in batch:
-            raise ValueError(f"batch: the key {key!r} is missing; got {sorted(batch)}")
-        require_shape(f"batch {key}", np.shape(batch[key]), *rows)
-    for key, space in spaces.observations.items():
-        if key in batch:
-            require_shape(f"batch {key}", np.shape(batch[key]), *rows, *space.array_shape)
+        require_shape(f"batch[{key!r}]", np.shape(batch[key]), *rows)
+    require_observations("batch", batch, spaces, rows)
 
     feature = networks.feature(deter, stoch)
     predictions = networks.decoder(params, feature, spaces, config)
@@ -180,30 +174,27 @@ def open_loop(
 
     Returns:
       At every step, by observation key: Vector [B, T, size] in its own units, Discrete [B, T, sum of classes]
-      probabilities, Image [B, T, height, width, channels] in [0, 1]; and "reward" [B, T], "continue_" [B, T]
-      probabilities.
+      probabilities, Image [B, T, height, width, channels] in [0, 1]; and "reward" and the probability "continue_"
+      [B, T].
 
     Raises:
-      ValueError: a key is missing, a shape, dtype or Discrete value does not fit, or the context is not within the
+      ValueError: a key is missing, a shape, dtype or Discrete value does not fit, or the context is no part of the
         sequence.
     """
     is_first = np.asarray(is_first, dtype=bool)
     require_shape("is_first", is_first.shape, "B", "T")
     rows, steps = is_first.shape
-    if not 1 <= context < steps:
-        raise ValueError(f"context: expected 1 to {steps - 1} steps of {steps}, got {context}")
+    require(1 <= context < steps, "context", f"1 to {steps - 1} steps of {steps}", context)
     prev_action = checked("prev_action", prev_action, rows, steps, spaces.action_size)
+    posterior_noise = checked("noise['posterior']", noise["posterior"], rows, context, config.stoch)
     prior_noise = checked("noise['prior']", noise["prior"], rows, steps - context, config.stoch)
-    for key, space in spaces.observations.items():
-        if key not in observation:
-            raise ValueError(f"observation: the key {key!r} is missing; got {sorted(observation)}")
-        require_shape(f"observation {key!r}", np.shape(observation[key]), rows, steps, *space.array_shape)
+    require_observations("observation", observation, spaces, (rows, steps))
 
     seen = {key: np.asarray(observation[key])[:, :context] for key in spaces.observations}
     tokens = networks.encoder(params, seen, spaces, config)
     zeros = {"deter": np.zeros((rows, config.deter)), "stoch": np.zeros((rows, config.stoch, config.classes))}
     states = rssm.observe(
-        params, zeros, tokens, prev_action[:, :context], is_first[:, :context], noise["posterior"], config
+        params, zeros, tokens, prev_action[:, :context], is_first[:, :context], posterior_noise, config
     )
     deters, stochs = list(np.moveaxis(states["deter"], 1, 0)), list(np.moveaxis(states["stoch"], 1, 0))
     for t in range(context, steps):
@@ -236,8 +227,7 @@ def _in_units(prediction: Array, space: Vector | Discrete | Image) -> Array:
 
 
 def _cross_entropy(logits: Array, target: Array, space: Discrete) -> Array:
-    """Cross entropy of one categorical for each entry of a Discrete, summed over the entries: [..., sum of classes] ->
-    [...]."""
+    """Cross entropy of one categorical for each entry of a Discrete, their sum: [..., sum of classes] -> [...]."""
     total, first = np.zeros(logits.shape[:-1]), 0
     for classes in space.classes:
         entry = slice(first, first + classes)

@@ -1,8 +1,7 @@
-"""The typed configuration, filled from hyperparameters.toml, profiles.toml and sizes.toml beside this file, and the
-benchmark protocols.
+"""The typed configuration and the benchmark protocols, filled from the TOML files beside this one.
 
-A configuration is made in this order, later values winning: the value of the profile `paper`, the values of the chosen
-profile, the values of the chosen model size, explicit overrides.
+A configuration is made in this order, later values winning: the value of the profile `paper` (hyperparameters.toml),
+the values of the chosen profile (profiles.toml) and of the chosen model size (sizes.toml), explicit overrides.
 """
 
 import dataclasses
@@ -94,8 +93,7 @@ class Config:
 
     @property
     def imagined_discount(self) -> float:
-        """What multiplies a continue prediction in imagination: gamma, or 1 where the continue head has learned it
-        (D-06)."""
+        """What multiplies a continue prediction in imagination: gamma, or 1 where the head has learned it (D-06)."""
         return self.discount if self.continue_target == "hard" else 1.0
 
     @property
@@ -113,12 +111,8 @@ class Config:
             _check_value(name, getattr(self, name), entry)
         _require(self.deter % self.blocks == 0, "deter", self.deter, f"a multiple of blocks = {self.blocks}")
         stem = self.cnn_multipliers[-1] * self.cnn_depth
-        _require(
-            stem % self.blocks == 0,
-            "cnn_depth",
-            self.cnn_depth,
-            f"last multiplier x cnn_depth a multiple of blocks = {self.blocks}",
-        )
+        divisible = f"last multiplier x cnn_depth a multiple of blocks = {self.blocks}"
+        _require(stem % self.blocks == 0, "cnn_depth", self.cnn_depth, divisible)
         _require(self.bins % 2 == 1 and self.bins >= 3, "bins", self.bins, "an odd number of at least 3")
         _require(self.discount_horizon > 1, "discount_horizon", self.discount_horizon, "more than 1")
         _require(self.actor_min_std > 0, "actor_min_std", self.actor_min_std, "more than 0")
@@ -156,14 +150,8 @@ def _check_value(name: str, value: object, entry: dict[str, Any]) -> None:
         valid = isinstance(value, tuple) and len(value) >= 2 and all(isinstance(x, int) and x > 0 for x in value)
         _require(valid, name, value, "at least two whole numbers above 0")
     elif isinstance(default, int):
-        valid = (
-            isinstance(value, int)
-            and not isinstance(value, bool)
-            and (value > 0 or (value == 0 and name in _MAY_BE_ZERO))
-        )
-        _require(
-            valid, name, value, "a whole number above 0" if name not in _MAY_BE_ZERO else "a whole number, 0 or more"
-        )
+        least, expected = (0, "a whole number, 0 or more") if name in _MAY_BE_ZERO else (1, "a whole number above 0")
+        _require(isinstance(value, int) and not isinstance(value, bool) and value >= least, name, value, expected)
     else:
         _require(isinstance(value, float) and 0 <= value < float("inf"), name, value, "a finite number, 0 or more")
 
@@ -184,8 +172,7 @@ def load_config(profile: str = "paper", size: str = "200m", **overrides: Any) ->
 
 
 def _convert(value: Any, default: Any) -> Any:
-    """Lists become tuples, and whole numbers become floats where the default is one: TOML and command lines write 1 for
-    1.0."""
+    """Lists become tuples, whole numbers become floats where the default is one: TOML and shells write 1 for 1.0."""
     if isinstance(value, list):
         return tuple(value)
     if isinstance(default, float) and isinstance(value, int) and not isinstance(value, bool):

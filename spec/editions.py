@@ -1,5 +1,4 @@
-"""The editions of the algorithm: which there are, and where each leaves the requirements. The data are in
-editions.toml."""
+"""The editions of the algorithm, and where each leaves the requirements. The data are in editions.toml."""
 
 import dataclasses
 import functools
@@ -30,8 +29,8 @@ class Difference:
 class Edition:
     """One edition.
 
-    title, source, date: which program or text it is. profile: the name of its values. differs: requirement id -> what
-    holds instead.
+    title, source, date: which program or text it is. profile: the name of its values.
+    differs: requirement id -> what holds instead.
     beyond: "row.function" of the reference, what the edition has otherwise without a model here.
     """
 

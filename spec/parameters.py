@@ -1,5 +1,4 @@
-"""The parameter table: canonical name -> shape and initializer, derived from a configuration and spaces in this one
-place.
+"""The parameter table, canonical name -> shape and initializer: derived from configuration and spaces, here alone.
 
 Names are paths: `rssm/gru/kernel`. A linear layer has `kernel` [in, out] and `bias` [out]; a block-linear layer has
 `kernel` [blocks, in/blocks, out/blocks] and `bias` [out]; a convolution has `kernel` [5, 5, in, out] and `bias` [out];
@@ -119,11 +118,10 @@ def _decoder(config: Config, spaces: Spaces) -> Entries:
             yield from _linear(f"decoder/vector/out/{key}", config.units, space.encoded_size, norm=False)
     if spaces.images:
         height, width, channels = bottleneck(config, spaces)
-        yield from _block_linear(
-            "decoder/image/deter", config.blocks, config.deter, height * width * channels, norm=False
-        )
+        pixels = height * width * channels
+        yield from _block_linear("decoder/image/deter", config.blocks, config.deter, pixels, norm=False)
         yield from _linear("decoder/image/stoch_hidden", config.stoch * config.classes, 2 * config.units)
-        yield from _linear("decoder/image/stoch", 2 * config.units, height * width * channels, norm=False)
+        yield from _linear("decoder/image/stoch", 2 * config.units, pixels, norm=False)
         yield "decoder/image/stem/scale", Parameter((channels,), "ones")
         for index, multiplier in enumerate(reversed(config.cnn_multipliers[:-1])):
             outputs = multiplier * config.cnn_depth
@@ -136,13 +134,8 @@ def _actor(config: Config, spaces: Spaces) -> Entries:
     yield from _mlp("actor", config.actor_layers, config.feature_size, config.units)
     for key, space in spaces.actions.items():
         for output in ("logits",) if isinstance(space, Discrete) else ("mean", "std"):
-            yield from _linear(
-                f"actor/out/{key}/{output}",
-                config.units,
-                space.encoded_size,
-                norm=False,
-                outscale=config.actor_outscale,
-            )
+            name, scale = f"actor/out/{key}/{output}", config.actor_outscale
+            yield from _linear(name, config.units, space.encoded_size, norm=False, outscale=scale)
 
 
 def bottleneck(config: Config, spaces: Spaces) -> tuple[int, int, int]:

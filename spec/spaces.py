@@ -1,6 +1,6 @@
 """What an agent sees and does, in the form that the algorithm works with.
 
-Observations and actions are dictionaries by key, always walked in sorted order. Arrays of one time step, with any
+Observations and actions are dictionaries by key, always walked in sorted order. One time step of each, after any
 leading axes:
 
   Vector    float [..., size]
@@ -123,8 +123,7 @@ class Spaces:
 
     @property
     def action_noise_size(self) -> int:
-        """Random numbers that one action takes: a standard normal for each real number, a uniform for each
-        categorical."""
+        """Random numbers that one action takes: a normal for each real number, a uniform for each categorical."""
         return sum(space.array_shape[0] for space in self.actions.values())
 
     def to_json(self) -> dict[str, Any]:
@@ -151,9 +150,7 @@ class Spaces:
                     {key: _from_json(f"observation {key!r}", entry, _OBSERVED) for key, entry in observations.items()},
                     {key: _from_json(f"action {key!r}", entry, _CHOSEN) for key, entry in actions.items()},
                 )
-        raise ValueError(
-            f"spaces: expected an object with the objects observations and actions, got {description!r:.80}"
-        )
+        raise ValueError(f"spaces: expected an object with observations and actions, got {description!r:.80}")
 
 
 _OBSERVED, _CHOSEN = (Vector, Discrete, Image), (Vector, Discrete)
@@ -166,14 +163,11 @@ def _from_json(name: str, entry: Any, kinds: tuple[type, ...]) -> Any:
             space = Vector(size)
         case {"kind": "discrete", "classes": [*classes]} if _whole(*classes):
             space = Discrete(tuple(classes))
-        case {"kind": "image", "height": height, "width": width, "channels": channels} if _whole(
-            height, width, channels
-        ):
-            space = Image(height, width, channels)
+        case {"kind": "image", "height": h, "width": w, "channels": c} if _whole(h, w, c):
+            space = Image(h, w, c)
     if not isinstance(space, kinds):
-        raise ValueError(
-            f"{name}: expected a {' or '.join(kind.__name__.lower() for kind in kinds)} space, got {entry!r:.80}"
-        )
+        expected = " or ".join(kind.__name__.lower() for kind in kinds)
+        raise ValueError(f"{name}: expected a {expected} space, got {entry!r:.80}")
     return space
 
 

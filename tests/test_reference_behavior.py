@@ -140,7 +140,7 @@ def test_nan_is_not_repaired():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: sample_action({}, [0.5], ONE_CATEGORICAL, CONFIG), "action keys"),
+        (lambda: sample_action({}, [0.5], ONE_CATEGORICAL, CONFIG), "outputs: missing 'a'"),
         (lambda: sample_action({"a": {"mean": [0.0]}}, [0.5], ONE_NORMAL, CONFIG), r"outputs\['a'\]"),
         (lambda: sample_action({"a": {"logits": [0.0]}}, [0.5], ONE_CATEGORICAL, CONFIG), "logits"),
         (lambda: sample_action(normal_outputs(), [0.5, 0.5], ONE_NORMAL, CONFIG), "noise"),

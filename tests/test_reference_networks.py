@@ -49,11 +49,11 @@ def test_vectors_share_one_mlp(monkeypatch):
 @pytest.mark.parametrize(
     ("value", "message"),
     [
-        (np.array([3, 0]), r"'item', entry 0: expected values in 0 .. 2, got 3"),
-        (np.array([0, 2]), r"'item', entry 1: expected values in 0 .. 1, got 2"),
-        (np.array([-1, 0]), r"'item', entry 0: expected values in 0 .. 2, got -1"),
-        (np.array([1.0, 0.0]), r"'item': a Discrete needs an integer dtype, got float64"),
-        (np.array([1]), r"'item': expected shape \[\.\.\., 2\], got \[1\]"),
+        (np.array([3, 0]), r"observations\['item'\], entry 0: expected values in 0 .. 2, got 3"),
+        (np.array([0, 2]), r"observations\['item'\], entry 1: expected values in 0 .. 1, got 2"),
+        (np.array([-1, 0]), r"observations\['item'\], entry 0: expected values in 0 .. 2, got -1"),
+        (np.array([1.0, 0.0]), r"observations\['item'\]: expected an integer dtype, got float64"),
+        (np.array([1]), r"observations\['item'\]: expected shape \[\.\.\., 2\], got \[1\]"),
     ],
 )
 def test_wrong_discrete_values_are_refused(value, message):
@@ -74,14 +74,14 @@ def test_images_are_uint8_and_scaled(monkeypatch):
     networks.encoder(make_params(config, spaces), {"a": dark, "b": bright}, spaces, config)
     np.testing.assert_allclose(seen[0][0, :, :, 2], [[0.0019607843, 0.5], [0.5, 0.5]])
     assert (seen[0][..., :2] == -0.5).all()
-    with pytest.raises(ValueError, match="'a': an Image needs the dtype uint8, got float64"):
+    with pytest.raises(ValueError, match=r"observations\['a'\]: expected dtype uint8, got float64"):
         networks.encoder(make_params(config, spaces), {"a": dark / 255, "b": bright}, spaces, config)
 
 
 def test_missing_key_and_odd_sides_are_refused():
     spaces = Spaces({"view": Image(10, 8, 1)}, ACTIONS)
     config = small_config(cnn_multipliers=(1, 1, 1))  # two halvings
-    with pytest.raises(ValueError, match=r"'view' is missing; got the keys \['sight'\]"):
+    with pytest.raises(ValueError, match="observations: missing 'view'; unknown 'sight'"):
         networks.encoder({}, {"sight": np.zeros((10, 8, 1), np.uint8)}, spaces, config)
     with pytest.raises(ValueError, match="multiples of 4"):
         networks.encoder({}, {"view": np.zeros((10, 8, 1), np.uint8)}, spaces, config)
@@ -303,7 +303,7 @@ def test_wrong_shapes_are_refused():
     spaces = Spaces({"a": Vector(2), "b": Vector(1)}, ACTIONS)
     config = small_config()
     params = make_params(config, spaces)
-    with pytest.raises(ValueError, match=r"'b': expected shape \[5, 1\], got \[4, 1\]"):
+    with pytest.raises(ValueError, match=r"observations\['b'\]: expected shape \[5, 1\], got \[4, 1\]"):
         networks.encoder(params, {"a": np.zeros((5, 2)), "b": np.zeros((4, 1))}, spaces, config)
     for call in (networks.reward_head, networks.continue_head, networks.critic):
         with pytest.raises(ValueError, match=r"feature: expected shape \[\.\.\., 10\], got \[3, 9\]"):

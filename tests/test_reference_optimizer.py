@@ -98,11 +98,11 @@ def test_non_finite_gradients_are_not_repaired():
 def test_names_and_shapes_must_match():
     """[OPT-18]"""
     params = {"a": np.array([1.0])}
-    with pytest.raises(ValueError, match=r"gradients.*missing: \['a'\]"):
+    with pytest.raises(ValueError, match="gradients: missing 'a'"):
         optimizer_step(params, {}, fresh(params), PAPER)
-    with pytest.raises(ValueError, match=r"gradients.*not in params: \['critic/b'\]"):
+    with pytest.raises(ValueError, match="gradients: unknown 'critic/b'"):
         optimizer_step(params, {"a": np.ones(1), "critic/b": np.ones(1)}, fresh(params), PAPER)
-    with pytest.raises(ValueError, match=r"'a'.*gradient"):
+    with pytest.raises(ValueError, match=r"gradients: 'a': expected shape \[1\], got \[2\]"):
         optimizer_step(params, {"a": np.ones(2)}, fresh(params), PAPER)
     with pytest.raises(ValueError, match="momentum"):
         optimizer_step(params, {"a": np.ones(1)}, {**fresh(params), "momentum": {}}, PAPER)

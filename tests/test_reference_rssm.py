@@ -265,5 +265,5 @@ def test_wrong_carry_is_refused():
     config = small_config()
     params, inputs = random_params(config), random_inputs(config)
     inputs["carry"]["stoch"] = inputs["carry"]["stoch"].reshape(3, 6)
-    with pytest.raises(ValueError, match=r"carry stoch: expected shape \[3, 2, 3\], got \[3, 6\]"):
+    with pytest.raises(ValueError, match=r"carry\['stoch'\]: expected shape \[3, 2, 3\], got \[3, 6\]"):
         run(params, inputs, config)

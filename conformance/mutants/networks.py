@@ -33,9 +33,7 @@ MUTANTS = (
         provenance="sheeprl until issue 214, NM512/dreamerv3-torch until commit a9e85e8",
         violates=("NET-6",),
         fix="Subtract 1/2 from the scaled image, in the encoder only.",
-        edits={
-            "networks.encoder": {"scaled_image(key, observations[key]) - 0.5": "scaled_image(key, observations[key])"}
-        },
+        edits={"networks.encoder": {"scaled_image(observations[key]) - 0.5": "scaled_image(observations[key])"}},
     ),
     Mutant(
         name="images_not_scaled",
@@ -47,7 +45,7 @@ MUTANTS = (
         fix="Divide by 255, in training and in acting.",
         edits={
             "networks.encoder": {
-                "scaled_image(key, observations[key]) - 0.5": "255.0 * scaled_image(key, observations[key]) - 0.5"
+                "scaled_image(observations[key]) - 0.5": "255.0 * scaled_image(observations[key]) - 0.5"
             }
         },
     ),

@@ -128,7 +128,7 @@ MUTANTS = (
         fix="Compare with the image divided by 255.",
         edits={
             "world_model.reconstruction_losses": {
-                "target = scaled_image(key, observations[key])": "target = scaled_image(key, observations[key]) - 0.5"
+                "target = scaled_image(observations[key])": "target = scaled_image(observations[key]) - 0.5"
             }
         },
     ),

@@ -1,0 +1,112 @@
+"""Checks of arguments, and the precisions of a configuration.
+
+An error names the argument, what was expected and what came. The `require` functions are the same in every column.
+Shapes are static: in compiled code the checks cost nothing.
+"""
+
+from collections.abc import Iterable, Mapping
+from types import EllipsisType
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+from spec import Config, Discrete, Image, Spaces
+
+Observations = Mapping[str, jax.Array]
+
+LISTED = 8  # problems that one message names
+
+
+def compute_dtype(config: Config) -> jnp.dtype:
+    """Of activations. [CON-23]"""
+    return jnp.dtype(config.compute_dtype)
+
+
+def wide_dtype(config: Config) -> jnp.dtype:
+    """Of parameters, losses and everything else that is never narrower than float32. [CON-22] [CON-23]"""
+    return jnp.promote_types(compute_dtype(config), jnp.float32)
+
+
+def widen(x: ArrayLike) -> jax.Array:
+    """x in float32 or float64: lower precisions, integers and booleans become float32. [TRA-1] [DIS-1]"""
+    array = jnp.asarray(x)
+    return array if array.dtype == jnp.float64 else array.astype(jnp.float32)
+
+
+def require(condition: bool, name: str, expected: object, got: object) -> None:
+    """Raises ValueError unless the condition holds."""
+    if not condition:
+        raise ValueError(f"{name}: expected {expected}, got {got}")
+
+
+def require_shape(name: str, shape: tuple[int, ...], *expected: int | str | EllipsisType) -> None:
+    """Raises ValueError unless the shape is the expected one. [CON-8]
+
+    expected: for each axis its length, or a letter for any length; a leading `...` stands for any number of axes.
+    """
+    axes = expected[1:] if expected[:1] == (...,) else expected
+    last = shape[max(0, len(shape) - len(axes)) :] if len(axes) < len(expected) else shape
+    if last == axes:  # the usual case, at little cost: a train step of eager code comes here a thousand times
+        return
+    fits = [isinstance(axis, str) or axis == length for axis, length in zip(axes, last, strict=False)]
+    if len(last) != len(axes) or not all(fits):
+        wanted = ", ".join("..." if axis is ... else str(axis) for axis in expected)
+        raise ValueError(f"{name}: expected shape [{wanted}], got {list(shape)}")
+
+
+def require_keys(name: str, given: Iterable[str], expected: Iterable[str], exactly: bool = False) -> None:
+    """Raises ValueError unless all expected keys are given and, with `exactly`, no others."""
+    given, expected = set(given), set(expected)
+    if exactly or not expected <= given:
+        _refuse(name, _differences(given, expected))
+
+
+def require_shapes(name: str, arrays: Mapping[str, Any], expected: Mapping[str, tuple[int, ...]]) -> None:
+    """Raises ValueError unless the arrays have exactly these names and shapes. [CON-8]"""
+    differing = [key for key in expected if key in arrays and np.shape(arrays[key]) != expected[key]]
+    wrong = [f"{key!r}: expected shape {list(expected[key])}, got {list(np.shape(arrays[key]))}" for key in differing]
+    _refuse(name, _differences(set(arrays), set(expected)) + wrong)
+
+
+def _differences(given: set[str], expected: set[str]) -> list[str]:
+    missing, unknown = sorted(expected - given), sorted(given - expected)
+    return [f"missing {key!r}" for key in missing] + [f"unknown {key!r}" for key in unknown]
+
+
+def _refuse(name: str, problems: list[str]) -> None:
+    """Raises ValueError if there are problems, and names the first few: a parameter table has hundreds of entries."""
+    if problems:
+        more = [f"{len(problems) - LISTED} more"] if len(problems) > LISTED else []
+        raise ValueError(f"{name}: {'; '.join(problems[:LISTED] + more)}")
+
+
+def require_same_shape(**arrays: jax.Array) -> None:
+    """Raises ValueError unless all arrays have the shape of the first. [CON-8]"""
+    (_, first), *others = arrays.items()
+    for name, array in others:
+        require_shape(name, array.shape, *first.shape)
+
+
+def require_observations(
+    name: str, observations: Observations, spaces: Spaces, leading: tuple[Any, ...] = (...,)
+) -> tuple[int, ...]:
+    """The leading axes of all observations, after checks of names, dtypes and shapes. [NET-2], [NET-4], [NET-6]
+
+    leading: what these axes must be, in the notation of `require_shape`.
+
+    Raises:
+      ValueError: naming the key. [NET-27] Classes of a Discrete are values, which compiled code cannot refuse.
+    """
+    require_keys(name, observations, spaces.observations)
+    for key, space in spaces.observations.items():
+        x = observations[key]
+        require_shape(f"{name}[{key!r}]", x.shape, *leading, *space.array_shape)
+        leading = x.shape[: x.ndim - len(space.array_shape)]  # the first key's, for all others
+        if isinstance(space, Image):
+            require(x.dtype == jnp.uint8, f"{name}[{key!r}]", "dtype uint8", x.dtype)
+        elif isinstance(space, Discrete):
+            require(jnp.issubdtype(x.dtype, jnp.integer), f"{name}[{key!r}]", "an integer dtype", x.dtype)
+    return leading
