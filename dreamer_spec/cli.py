@@ -1,6 +1,6 @@
 """The command `train`: options in, a run out, and one line for every mistake that the user can mend."""
 
-from dreamer_spec import before_numpy  # noqa: F401
+from dreamer_spec.system import before_numpy  # noqa: F401
 
 # isort: split
 import argparse
@@ -19,7 +19,6 @@ from conformance.output import never_fail
 from dreamer_spec import arguments as keywords
 from dreamer_spec.commands import COMMANDS
 from dreamer_spec.errors import UserError, is_out_of_memory
-from dreamer_spec.machine import own_version
 from dreamer_spec.options import (
     DEFAULT_PRESET,
     EVAL_ENV,
@@ -34,7 +33,8 @@ from dreamer_spec.options import (
     presets,
 )
 from dreamer_spec.replay.layout import DETER_DTYPES
-from dreamer_spec.signals import stoppable
+from dreamer_spec.system.machine import own_version
+from dreamer_spec.system.signals import stoppable
 from spec import built_profiles, hyperparameters, profiles, sizes
 
 BACKENDS = ("jax", "torch")
@@ -111,7 +111,10 @@ def _run(arguments: Sequence[str]) -> int:
             raise UserError(f"unknown command {name!r}{did_you_mean(name, COMMANDS)} (see train --help)")
         return importlib.import_module(f"dreamer_spec.commands.{name}").main(arguments[1:])
     runs = parse_runs(arguments)
-    from dreamer_spec import loop, seeds  # Only now: `--help` and mistakes in options shall not wait for Gymnasium.
+    from dreamer_spec.training import (
+        loop,
+        seeds,
+    )  # Only now: `--help` and mistakes in options shall not wait for Gymnasium.
 
     if len(runs) > 1:
         return seeds.run_all(runs, loop.run)

@@ -19,9 +19,9 @@ import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import save_file
 
+from dreamer_spec.disk.files import SUMS, flush, new_folder, open_sealed, remove_folder, require_intact, seal
+from dreamer_spec.disk.saved_agent import SavedAgent, acting_table, check_info, checked_parameters, config_from_json
 from dreamer_spec.errors import UserError
-from dreamer_spec.files import SUMS, flush, new_folder, open_sealed, remove_folder, require_intact, seal
-from dreamer_spec.saved_agent import SavedAgent, acting_table, check_info, checked_parameters, config_from_json
 from dreamer_spec.translation import Translation
 from reference_numpy import agent, training_loop
 from reference_numpy.shapes import require_shape

@@ -15,9 +15,10 @@ import pytest
 from train_fakes import EPISODE, FakeLearner
 from train_runs import Make, batches, logged, run_quietly, stored
 
-from dreamer_spec import checkpoint, files, loop, setup
+from dreamer_spec.disk import checkpoint, files
 from dreamer_spec.errors import UserError
-from dreamer_spec.resume import save
+from dreamer_spec.training import loop, setup
+from dreamer_spec.training.resume import save
 from reference_numpy.training_loop import derive_seed
 
 # Checkpoints
@@ -192,7 +193,7 @@ def test_a_checkpoint_is_complete_or_absent(make: Make, monkeypatch: pytest.Monk
         raise OSError("disk full")
 
     with monkeypatch.context() as patch:
-        patch.setattr("dreamer_spec.files.flush", fail)
+        patch.setattr("dreamer_spec.disk.files.flush", fail)
         with pytest.raises(UserError, match="disk full"):
             loop.run(make(steps=90), FakeLearner)
     assert checkpoint.open_checkpoint(make().logdir) == before
@@ -442,7 +443,7 @@ def test_what_ends_the_last_evaluation_does_not_cost_the_training(make: Make, mo
 
     options = make(eval_episodes=2)
     with monkeypatch.context() as patch:
-        patch.setattr("dreamer_spec.schedule.evaluate", fail)
+        patch.setattr("dreamer_spec.training.schedule.evaluate", fail)
         with pytest.raises(KeyboardInterrupt):
             loop.run(options, FakeLearner)
     saved = checkpoint.open_checkpoint(options.logdir)

@@ -20,11 +20,12 @@ from train_fakes import FakeLearner
 from train_runs import Make, run_quietly
 
 from conformance.problems import small_config
-from dreamer_spec import checkpoint, files, forecast, loop
 from dreamer_spec.cli import main
+from dreamer_spec.disk import checkpoint, files
+from dreamer_spec.disk.files import Unreadable
 from dreamer_spec.errors import UserError
-from dreamer_spec.files import Unreadable
 from dreamer_spec.replay import Replay
+from dreamer_spec.training import forecast, loop
 from spec import Spaces, Vector
 
 CONFIG = small_config("paper", "float32")

@@ -13,8 +13,16 @@ import pytest
 from conformance.problems import random_batch, random_state, small_config, spaces
 from dreamer_spec.backend import Learner, learner_class
 from dreamer_spec.commands import inspect
+from dreamer_spec.disk.incidents import (
+    Tally,
+    load_incident,
+    newest_incident,
+    offending,
+    save_incident,
+    stop_error,
+    tally,
+)
 from dreamer_spec.errors import UserError
-from dreamer_spec.nonfinite import Tally, load_incident, newest_incident, offending, save_incident, stop_error, tally
 from reference_numpy import agent, optimizer
 from spec import parameter_table
 
@@ -313,6 +321,6 @@ def test_incidents_that_say_something_else_are_refused(
     copy = Path(shutil.copytree(intact, tmp_path / "incident"))
     content = json.loads((copy / "incident.json").read_text())
     (copy / "incident.json").write_text(json.dumps({**content, entry: value}))
-    monkeypatch.setattr("dreamer_spec.nonfinite.require_intact", lambda folder, names: None)
+    monkeypatch.setattr("dreamer_spec.disk.incidents.require_intact", lambda folder, names: None)
     with pytest.raises(UserError, match=words):
         load_incident(copy)

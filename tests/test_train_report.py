@@ -14,8 +14,8 @@ import pytest
 from html_document import Document
 from PIL import Image
 
-from dreamer_spec import checkpoint
 from dreamer_spec.cli import main
+from dreamer_spec.disk import checkpoint
 from dreamer_spec.errors import UserError
 from dreamer_spec.report import svg
 from dreamer_spec.report.page import render

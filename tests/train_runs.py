@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from train_fakes import FakeLearner
 
-from dreamer_spec import loop, setup
-from dreamer_spec.logger import iterate_metrics
+from dreamer_spec.monitoring.logger import iterate_metrics
 from dreamer_spec.options import Options
+from dreamer_spec.training import loop, setup
 
 SMALL = {
     "deter": 8,

@@ -13,10 +13,10 @@ from rich.console import Console
 from rich.table import Table
 
 from dreamer_spec.backend import learner_class
-from dreamer_spec.checkpoint import Checkpoint, candidates, open_checkpoint
 from dreamer_spec.cli import Parser
+from dreamer_spec.disk.checkpoint import Checkpoint, candidates, open_checkpoint
+from dreamer_spec.disk.incidents import Incident, Tally, load_incident, newest_incident, nonfinite, offending, tally
 from dreamer_spec.errors import UserError
-from dreamer_spec.nonfinite import Incident, Tally, load_incident, newest_incident, nonfinite, offending, tally
 from spec import Spaces, hyperparameters, load_config, parameter_table
 
 DESCRIPTION = """Show what a train step met whose loss or gradient was not finite, or what a checkpoint holds.

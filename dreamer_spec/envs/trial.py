@@ -17,7 +17,7 @@ from dreamer_spec.envs.failure import Failure, attempt
 from dreamer_spec.envs.guest import guest
 from dreamer_spec.envs.process import DYING, begin_worker, ended, no_answer, not_started, start_method
 from dreamer_spec.envs.spaces import random_actions
-from dreamer_spec.signals import unbroken
+from dreamer_spec.system.signals import unbroken
 from dreamer_spec.translation import Translation
 
 SLOW_STEP = 5e-4  # seconds; from here on a process of its own is faster than taking turns

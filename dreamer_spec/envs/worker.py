@@ -20,7 +20,7 @@ from dreamer_spec.envs.guest import guest
 from dreamer_spec.envs.history import History
 from dreamer_spec.envs.process import DYING, ended, no_answer, not_started, start_method
 from dreamer_spec.envs.stream import Step, Stream
-from dreamer_spec.signals import unbroken
+from dreamer_spec.system.signals import unbroken
 from dreamer_spec.translation import Translation
 
 # What Gymnasium raises where the process has ended: when something is received, when it is sent, and when that had

@@ -22,8 +22,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from dreamer_spec.disk.files import Unreadable, entries, open_file, reading
 from dreamer_spec.errors import UserError
-from dreamer_spec.files import Unreadable, entries, open_file, reading
 from dreamer_spec.replay.layout import Layout, Sections
 from dreamer_spec.replay.positioned import BINARY, most_descriptors, read_at, write_at
 
@@ -277,7 +277,7 @@ def is_chunk(path: Path) -> bool:
 
 @contextlib.contextmanager
 def reading_chunk(path: Path) -> Iterator[None]:
-    """As dreamer_spec.files.reading, with what to do about a file that no mending helps."""
+    """As dreamer_spec.disk.files.reading, with what to do about a file that no mending helps."""
     try:
         with reading(path):
             yield

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamer_spec.files import open_file
+from dreamer_spec.disk.files import open_file
 from dreamer_spec.replay.chunks import Chunk, ChunkStore, Shape
 from dreamer_spec.replay.items import are_representable, decode, encode
 from dreamer_spec.replay.journal import entries, journal_epochs, journal_path, old_latents

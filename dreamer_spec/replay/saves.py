@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
-from dreamer_spec.files import Unreadable, entries, free_name, open_file, reading, replacing
+from dreamer_spec.disk.files import Unreadable, entries, free_name, open_file, reading, replacing
 from dreamer_spec.replay.chunks import chunk_numbers, chunk_path, disk_errors, next_number, numbers
 from dreamer_spec.replay.journal import Journal, journal_epochs, journal_path
 

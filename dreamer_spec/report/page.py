@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from html import escape
 from pathlib import Path
 
-from dreamer_spec.files import Unreadable, open_file, reading
+from dreamer_spec.disk.files import Unreadable, open_file, reading
 from dreamer_spec.report.charts import task_section
 from dreamer_spec.report.html import cell, details, table
 from dreamer_spec.report.results import result_cards, result_table

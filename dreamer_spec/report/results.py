@@ -7,7 +7,7 @@ from html import escape
 
 import numpy as np
 
-from dreamer_spec.logger import duration
+from dreamer_spec.monitoring.logger import duration
 from dreamer_spec.report.html import cell, swatch, table
 from dreamer_spec.report.runs import Group, RunLog, show
 

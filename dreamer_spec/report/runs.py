@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from dreamer_spec.about import read_about
+from dreamer_spec.disk.about import read_about
+from dreamer_spec.disk.files import SUMS, Unreadable, entries, read_json
 from dreamer_spec.errors import UserError
-from dreamer_spec.files import SUMS, Unreadable, entries, read_json
-from dreamer_spec.logger import iterate_metrics
+from dreamer_spec.monitoring.logger import iterate_metrics
 
 # Of the options, beside task, backend and hyperparameters, those that change what is learned: runs of one group agree
 # in all of them.

@@ -22,8 +22,7 @@ import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import save_file
 
-from dreamer_spec.errors import UserError
-from dreamer_spec.files import (
+from dreamer_spec.disk.files import (
     SUMS,
     Arrays,
     Sealed,
@@ -37,6 +36,7 @@ from dreamer_spec.files import (
     require_intact,
     seal,
 )
+from dreamer_spec.errors import UserError
 from dreamer_spec.options import may_change
 
 FORMAT = 4  # Since 4 it says how the environment's values are translated: what a policy made of it needs to act.
@@ -53,7 +53,7 @@ class Damaged(UserError):
 @dataclasses.dataclass(frozen=True)
 class Checkpoint:
     """info: format, identity (dreamer_spec.options.Options.identity), backend, spaces, counters, and what else
-    dreamer_spec/resume.py puts there.
+    dreamer_spec/training/resume.py puts there.
 
     Its files stay open, so that it can be read to the end even if the run removes it meanwhile.
     """

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dreamer_spec import arguments as keywords
+from dreamer_spec.disk.files import free_name, read_json, replacing
 from dreamer_spec.errors import writing
-from dreamer_spec.files import free_name, read_json, replacing
-from dreamer_spec.machine import describe
 from dreamer_spec.options import Options, presets
+from dreamer_spec.system.machine import describe
 from spec import Config, Spaces, built_profiles, load_config, sizes
 
 if TYPE_CHECKING:

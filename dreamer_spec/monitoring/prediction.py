@@ -1,5 +1,5 @@
 """Open-loop predictions of recorded episodes: record, predict, measure. Chapter: spec/06-world-model.md; pictures:
-dreamer_spec/pictures.py.
+dreamer_spec/monitoring/pictures.py.
 
 Sequences are a mapping of [B, T, ...] arrays: the observation keys, "reward", "is_first", "is_terminal" and "action",
 the flat action that was taken after each observation.

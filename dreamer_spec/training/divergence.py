@@ -3,10 +3,10 @@ to [LOOP-44]"""
 
 import numpy as np
 
-from dreamer_spec import checkpoint
+from dreamer_spec.disk import checkpoint
+from dreamer_spec.disk.incidents import save_incident, stop_error
 from dreamer_spec.errors import UserError
-from dreamer_spec.nonfinite import save_incident, stop_error
-from dreamer_spec.state import Run
+from dreamer_spec.training.state import Run
 
 
 def settle(run: Run) -> None:

@@ -4,12 +4,12 @@ from typing import Any
 
 import numpy as np
 
-from dreamer_spec.about import read_about
 from dreamer_spec.backend import Learner
-from dreamer_spec.checkpoint import Checkpoint, differences, open_checkpoint, space_entries
+from dreamer_spec.disk.about import read_about
+from dreamer_spec.disk.checkpoint import Checkpoint, differences, open_checkpoint, space_entries
+from dreamer_spec.disk.saved_agent import agent_of
 from dreamer_spec.errors import UserError
 from dreamer_spec.options import Options
-from dreamer_spec.saved_agent import agent_of
 from spec import Spaces, parameter_table
 
 TAKEN = ("params/", "slow_critic/", "return_range/")  # the optimizer begins anew

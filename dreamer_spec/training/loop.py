@@ -6,16 +6,16 @@ from contextlib import ExitStack
 
 import numpy as np
 
-from dreamer_spec import resume
 from dreamer_spec.backend import Learner
 from dreamer_spec.envs import Record
-from dreamer_spec.evaluation import report_failures
-from dreamer_spec.finite import finite_action, settle
 from dreamer_spec.options import Options
-from dreamer_spec.schedule import Schedule, evaluation_is_due, finish, log_episode
-from dreamer_spec.setup import prepare
-from dreamer_spec.signals import Stopped, stoppable
-from dreamer_spec.state import Run, TrainStep
+from dreamer_spec.system.signals import Stopped, stoppable
+from dreamer_spec.training import resume
+from dreamer_spec.training.divergence import finite_action, settle
+from dreamer_spec.training.evaluation import report_failures
+from dreamer_spec.training.schedule import Schedule, evaluation_is_due, finish, log_episode
+from dreamer_spec.training.setup import prepare
+from dreamer_spec.training.state import Run, TrainStep
 from reference_numpy.training_loop import can_train, derive_seed
 
 

@@ -11,7 +11,7 @@ PACKAGES = (
     *("dreamer-spec", "numpy", "jax", "jaxlib", "optax", "torch", "gymnasium"),
     *("dm-control", "mujoco", "ale-py", "box2d", "safetensors", "tensorboard", "wandb"),
 )
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def describe() -> dict[str, object]:

@@ -7,9 +7,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
+from dreamer_spec.disk.files import replacing
 from dreamer_spec.errors import writing
-from dreamer_spec.files import replacing
-from dreamer_spec.logger import iterate_metrics
+from dreamer_spec.monitoring.logger import iterate_metrics
 
 BLUE, ORANGE, GRAY = "#2563eb", "#ea580c", "#6b7280"
 EPISODE, EVALUATION, ERROR = "episode/return", "evaluation/return", "evaluation/return_standard_error"

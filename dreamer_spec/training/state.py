@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from dreamer_spec.backend import Learner
-from dreamer_spec.clock import Clock
 from dreamer_spec.envs import Environments, Record
-from dreamer_spec.logger import Display, Logger
+from dreamer_spec.monitoring.clock import Clock
+from dreamer_spec.monitoring.logger import Display, Logger
 from dreamer_spec.options import Options
 from dreamer_spec.replay import Prefetcher
 from reference_numpy.training_loop import ReplayRatio

@@ -4,7 +4,7 @@ or a resumed run could not be bit for bit what it would have been."""
 import os
 from typing import TYPE_CHECKING
 
-from dreamer_spec import cgroups
+from dreamer_spec.system import cgroups
 
 if TYPE_CHECKING:  # The command imports this module before NumPy.
     from spec import Config, Spaces

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import filelock
 
-from dreamer_spec.about import FORMAT, NAME, read_about, write_json
+from dreamer_spec.disk.about import FORMAT, NAME, read_about, write_json
+from dreamer_spec.disk.files import entries
 from dreamer_spec.errors import UserError
-from dreamer_spec.files import entries
 
 MARK = "has_checkpoint"
 MOST_NAMES = 5

@@ -4,11 +4,11 @@
 import traceback
 from collections.abc import Callable, Sequence
 
-from dreamer_spec.about import read_about
 from dreamer_spec.cli import say_error
+from dreamer_spec.disk.about import read_about
 from dreamer_spec.errors import UserError
+from dreamer_spec.monitoring.outcome import last_words, read_outcome, summary
 from dreamer_spec.options import Options
-from dreamer_spec.outcome import last_words, read_outcome, summary
 
 
 def run_all(runs: Sequence[Options], run: Callable[[Options], bool], say: Callable[[str], None] = print) -> int:

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from dreamer_spec.arguments import check as check_keywords
-from dreamer_spec.checkpoint import Checkpoint
+from dreamer_spec.disk.checkpoint import Checkpoint
+from dreamer_spec.disk.files import Arrays
 from dreamer_spec.errors import UserError
-from dreamer_spec.files import Arrays
-from dreamer_spec.machine import own_version
+from dreamer_spec.system.machine import own_version
 from dreamer_spec.translation import Translation
 from reference_numpy.shapes import require_shape
 from spec import Config, Parameter, Spaces, hyperparameters, load_config, parameter_table

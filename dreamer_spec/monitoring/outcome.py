@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from dreamer_spec.errors import UserError
-from dreamer_spec.logger import iterate_metrics
+from dreamer_spec.monitoring.logger import iterate_metrics
 from dreamer_spec.options import Options, names_code
 
 EPISODES = 20  # of training, that stand for an evaluation where there was none

@@ -10,18 +10,19 @@ from typing import Any
 
 import numpy as np
 
-from dreamer_spec import checkpoint, saved_run
-from dreamer_spec.about import options_json, read_about
-from dreamer_spec.checkpoint import Checkpoint, Damaged
+from dreamer_spec.disk import checkpoint
+from dreamer_spec.disk.about import options_json, read_about
+from dreamer_spec.disk.checkpoint import Checkpoint, Damaged
+from dreamer_spec.disk.files import Arrays, entries
+from dreamer_spec.disk.logdir import note_first_checkpoint, require_free
 from dreamer_spec.envs import Environments, History, Record
 from dreamer_spec.errors import UserError
-from dreamer_spec.files import Arrays, entries
-from dreamer_spec.finite import settle
-from dreamer_spec.logdir import note_first_checkpoint, require_free
-from dreamer_spec.logger import Display
+from dreamer_spec.monitoring.logger import Display
 from dreamer_spec.options import Options
 from dreamer_spec.replay import Replay, set_aside
-from dreamer_spec.state import Counters, Means, Run
+from dreamer_spec.training import saved_run
+from dreamer_spec.training.divergence import settle
+from dreamer_spec.training.state import Counters, Means, Run
 from reference_numpy.training_loop import can_train
 
 NOT_CHANGES = ("backend", "device", "logdir", "resume", "preflight", "from_")  # each start says its own

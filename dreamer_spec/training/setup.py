@@ -8,22 +8,24 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dreamer_spec import checkpoint, logdir, resume, saved_run, threads
-from dreamer_spec.about import About, write_about
 from dreamer_spec.backend import Learner, learner_class
-from dreamer_spec.checkpoint import Checkpoint
+from dreamer_spec.disk import checkpoint, logdir
+from dreamer_spec.disk.about import About, write_about
+from dreamer_spec.disk.checkpoint import Checkpoint
 from dreamer_spec.envs import Environments, Record, doubts, env_maker, try_out
 from dreamer_spec.envs.frames import repeated_twice
 from dreamer_spec.errors import UserError
-from dreamer_spec.evaluation import play_randomly, report_failure
-from dreamer_spec.forecast import say_memory
-from dreamer_spec.logger import Display, Logger
+from dreamer_spec.monitoring.logger import Display, Logger
+from dreamer_spec.monitoring.outcome import mean_of
 from dreamer_spec.options import Options
-from dreamer_spec.outcome import mean_of
 from dreamer_spec.replay import Prefetcher, Replay, erase
-from dreamer_spec.schedule import say_outlook
-from dreamer_spec.state import Counters, Run, Scores
-from dreamer_spec.warm_start import begin_from, require_same_origin
+from dreamer_spec.system import threads
+from dreamer_spec.training import resume, saved_run
+from dreamer_spec.training.evaluation import play_randomly, report_failure
+from dreamer_spec.training.forecast import say_memory
+from dreamer_spec.training.schedule import say_outlook
+from dreamer_spec.training.state import Counters, Run, Scores
+from dreamer_spec.training.warm_start import begin_from, require_same_origin
 from dreamer_spec.words import counted
 from reference_numpy.training_loop import ReplayRatio, derive_seed
 from spec import Spaces, parameter_table

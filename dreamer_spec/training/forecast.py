@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from dreamer_spec import cgroups
 from dreamer_spec.errors import UserError
-from dreamer_spec.logger import duration
-from dreamer_spec.machine import physical_memory
+from dreamer_spec.monitoring.logger import duration
 from dreamer_spec.options import Options
 from dreamer_spec.replay.layout import TYPES, Layout
-from dreamer_spec.state import Run
+from dreamer_spec.system import cgroups
+from dreamer_spec.system.machine import physical_memory
+from dreamer_spec.training.state import Run
 from spec import Discrete, Image, Spaces
 
 COPIES = 5  # of all parameters, in float32: themselves, the gradient, two moments, and what an update computes

@@ -19,9 +19,9 @@ from tensorboard.compat.proto.summary_pb2 import Summary
 from tensorboard.summary.writer.event_file_writer import EventFileWriter
 
 from conformance.output import Unfailing
-from dreamer_spec.about import About
+from dreamer_spec.disk.about import About
+from dreamer_spec.disk.files import open_file, reading
 from dreamer_spec.errors import UserError, writing
-from dreamer_spec.files import open_file, reading
 
 PLAIN_EVERY = 10.0  # seconds between lines where there is no terminal
 
@@ -38,7 +38,7 @@ class Logger:
     position: the size of metrics.jsonl, in bytes, at the checkpoint that is continued: what came later is cut off, and
     the resumed run writes it again. TensorBoard is told to hide it, Weights & Biases keeps what it has. None begins a
     new file.
-    wandb: a project of Weights & Biases; needs `about`, of dreamer_spec/about.py, whose `id` lets a resumed run
+    wandb: a project of Weights & Biases; needs `about`, of dreamer_spec/disk/about.py, whose `id` lets a resumed run
     continue where it was.
     warnings: what was wrong with the file.
 

@@ -19,8 +19,8 @@ from matplotlib.patches import Patch
 from PIL import Image as Pillow
 from PIL import ImageColor, ImageDraw, ImageFont
 
-from dreamer_spec.curve import BLUE, GRAY, ORANGE
-from dreamer_spec.prediction import CONTEXT, Sequences, true_class_probabilities
+from dreamer_spec.monitoring.curve import BLUE, GRAY, ORANGE
+from dreamer_spec.monitoring.prediction import CONTEXT, Sequences, true_class_probabilities
 from reference_numpy.transforms import symlog
 from spec import Discrete, Spaces, Vector
 

@@ -13,11 +13,11 @@ from typing import Any
 import jsonschema
 import numpy as np
 
-from dreamer_spec.checkpoint import Checkpoint, name_of
+from dreamer_spec.disk.checkpoint import Checkpoint, name_of
+from dreamer_spec.disk.files import Arrays
 from dreamer_spec.envs.history import LONGEST
 from dreamer_spec.errors import UserError
-from dreamer_spec.files import Arrays
-from dreamer_spec.state import Counters
+from dreamer_spec.training.state import Counters
 from spec import Config, Discrete, Image, Spaces
 
 COUNT = {"type": "count"}

@@ -9,19 +9,19 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from dreamer_spec import resume
-from dreamer_spec.curve import draw_curve
 from dreamer_spec.envs import Record
 from dreamer_spec.envs.info import is_pattern, names_of
 from dreamer_spec.errors import writing
-from dreamer_spec.evaluation import Agent, Episode, Interrupted, evaluate, report_failures
-from dreamer_spec.finite import finite_action, mean_metrics
-from dreamer_spec.forecast import TimeForecast
-from dreamer_spec.logger import duration
-from dreamer_spec.outcome import first_train_step, last_words, next_commands, read_outcome, why_untrained
-from dreamer_spec.pictures import draw_predictions, prune_pictures
-from dreamer_spec.prediction import SequenceRecorder, predict, prediction_errors
-from dreamer_spec.state import Run
+from dreamer_spec.monitoring.curve import draw_curve
+from dreamer_spec.monitoring.logger import duration
+from dreamer_spec.monitoring.outcome import first_train_step, last_words, next_commands, read_outcome, why_untrained
+from dreamer_spec.monitoring.pictures import draw_predictions, prune_pictures
+from dreamer_spec.monitoring.prediction import SequenceRecorder, predict, prediction_errors
+from dreamer_spec.training import resume
+from dreamer_spec.training.divergence import finite_action, mean_metrics
+from dreamer_spec.training.evaluation import Agent, Episode, Interrupted, evaluate, report_failures
+from dreamer_spec.training.forecast import TimeForecast
+from dreamer_spec.training.state import Run
 from reference_numpy.training_loop import derive_seed
 
 

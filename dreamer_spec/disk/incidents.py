@@ -22,8 +22,8 @@ from safetensors import SafetensorError
 from safetensors.numpy import save_file
 
 from dreamer_spec.backend import Learner
+from dreamer_spec.disk.files import SUMS, entries, flush, new_folder, open_sealed, remove_folder, require_intact, seal
 from dreamer_spec.errors import UserError
-from dreamer_spec.files import SUMS, entries, flush, new_folder, open_sealed, remove_folder, require_intact, seal
 
 FORMAT = 1
 FILES = ("learner.safetensors", "batch.safetensors", "incident.json")
