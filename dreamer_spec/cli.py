@@ -18,7 +18,7 @@ from typing import Any, NoReturn
 from conformance.output import never_fail
 from dreamer_spec import arguments as keywords
 from dreamer_spec.commands import COMMANDS
-from dreamer_spec.errors import UserError, is_out_of_memory
+from dreamer_spec.errors import UserError, is_out_of_memory, say_error
 from dreamer_spec.options import (
     DEFAULT_PRESET,
     EVAL_ENV,
@@ -95,13 +95,6 @@ def command() -> None:
         sys.stderr.flush()
         os._exit(code)
     sys.exit(code)
-
-
-def say_error(error: UserError, where: str = "") -> None:
-    """The one line of a mistake that the user can mend, on stderr."""
-    if error.details:
-        print(error.details.rstrip(), file=sys.stderr)
-    print(f"train: error: {where}{' '.join(str(error).split())}", file=sys.stderr)
 
 
 def _run(arguments: Sequence[str]) -> int:

@@ -1,5 +1,6 @@
 """The one kind of error that `train` answers with a line instead of a traceback."""
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,6 +17,13 @@ class UserError(Exception):
     def __init__(self, message: str, details: str = "") -> None:
         super().__init__(message)
         self.details = details
+
+
+def say_error(error: UserError, where: str = "") -> None:
+    """The one line of a mistake that the user can mend, on stderr."""
+    if error.details:
+        print(error.details.rstrip(), file=sys.stderr)
+    print(f"train: error: {where}{' '.join(str(error).split())}", file=sys.stderr)
 
 
 @contextmanager

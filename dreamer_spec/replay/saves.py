@@ -47,7 +47,7 @@ class Saved:
     chunks: frozenset[int]
 
 
-class History:
+class Epochs:
     """The epochs of a directory: an epoch begins with a save, epoch 0 with an empty buffer.
 
     kept: epoch -> save that can be restored. journal: of the epoch that is going on, None in epoch 0, when nothing

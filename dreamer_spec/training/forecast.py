@@ -11,7 +11,7 @@ import numpy as np
 from dreamer_spec.errors import UserError
 from dreamer_spec.monitoring.logger import duration
 from dreamer_spec.options import Options
-from dreamer_spec.replay.layout import TYPES, Layout
+from dreamer_spec.replay.layout import TYPES, RecordLayout
 from dreamer_spec.system import cgroups
 from dreamer_spec.system.machine import physical_memory
 from dreamer_spec.training.state import Run
@@ -65,7 +65,7 @@ def record_bytes(spaces: Spaces, options: Options) -> int:
         **{key: (np.dtype(_dtype(space)), space.array_shape) for key, space in spaces.observations.items()},
         **{name: (np.dtype(kind), shapes.get(name, ())) for name, kind in TYPES.items()},
     }
-    return Layout(entries, options.replay_deter, config.classes).record_bytes
+    return RecordLayout(entries, options.replay_deter, config.classes).record_bytes
 
 
 def _dtype(space: Any) -> type[np.generic]:

@@ -4,9 +4,8 @@
 import traceback
 from collections.abc import Callable, Sequence
 
-from dreamer_spec.cli import say_error
 from dreamer_spec.disk.about import read_about
-from dreamer_spec.errors import UserError
+from dreamer_spec.errors import UserError, say_error
 from dreamer_spec.monitoring.outcome import last_words, read_outcome, summary
 from dreamer_spec.options import Options
 
