@@ -15,7 +15,7 @@ import pytest
 from train_fakes import EPISODE, FakeLearner
 from train_runs import Make, batches, logged, run_quietly, stored
 
-from dreamer_spec.disk import checkpoint, files
+from dreamer_spec.disk import checkpoint, folders
 from dreamer_spec.errors import UserError
 from dreamer_spec.training import loop, setup
 from dreamer_spec.training.resume import save
@@ -193,7 +193,7 @@ def test_a_checkpoint_is_complete_or_absent(make: Make, monkeypatch: pytest.Monk
         raise OSError("disk full")
 
     with monkeypatch.context() as patch:
-        patch.setattr("dreamer_spec.disk.files.flush", fail)
+        patch.setattr("dreamer_spec.disk.folders.flush", fail)
         with pytest.raises(UserError, match="disk full"):
             loop.run(make(steps=90), FakeLearner)
     assert checkpoint.open_checkpoint(make().logdir) == before
@@ -243,7 +243,7 @@ def spoil(path: Path, damage: str) -> None:
         path.unlink()
 
 
-@pytest.mark.parametrize("name", ["learner.safetensors", "loop.safetensors", "run.json", "SHA256SUMS"])
+@pytest.mark.parametrize("name", ["learner.safetensors", "loop.safetensors", "checkpoint.json", "SHA256SUMS"])
 @pytest.mark.parametrize("damage", ["cut off", "a flipped bit", "missing"])
 def test_a_damaged_checkpoint_falls_back_to_the_one_before(
     make: Make, name: str, damage: str, capsys: pytest.CaptureFixture[str]
@@ -343,15 +343,15 @@ def test_forged_descriptions_are_refused_or_sound(make: Make, tmp_path: Path) ->
     options = make(task="gym:CartPole-v1", steps=40, eval_every=20, eval_episodes=1)
     loop.run(options, FakeLearner)
     folder = "checkpoints/000000000040"
-    description = json.loads((options.logdir / folder / "run.json").read_text())
+    description = json.loads((options.logdir / folder / "checkpoint.json").read_text())
     rng, outcomes = random.Random(0), []
     for number in range(120):
         logdir = tmp_path / str(number)
         shutil.copytree(options.logdir, logdir)
         forged = json.loads(json.dumps(description))
         forge(forged, rng)
-        (logdir / folder / "run.json").write_text(json.dumps(forged))
-        files.seal(logdir / folder, checkpoint.FILES)
+        (logdir / folder / "checkpoint.json").write_text(json.dumps(forged))
+        folders.seal(logdir / folder, checkpoint.FILES)
         try:
             run_quietly(dataclasses.replace(options, logdir=logdir, steps=44))
             outcomes.append("sound")
@@ -364,7 +364,7 @@ def test_forged_descriptions_are_refused_or_sound(make: Make, tmp_path: Path) ->
 
 def test_a_checkpoint_of_another_format_is_refused(make: Make) -> None:
     loop.run(make(), FakeLearner)
-    path = make().logdir / "checkpoints" / "000000000060" / "run.json"
+    path = make().logdir / "checkpoints" / "000000000060" / "checkpoint.json"
     path.write_text(path.read_text().replace('"format": 4', '"format": 3'))
     with pytest.raises(UserError, match="format 3; this version reads format 4"):
         loop.run(make(steps=90), FakeLearner)

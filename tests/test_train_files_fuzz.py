@@ -27,7 +27,8 @@ from train_agents import save_checkpoint
 
 from conformance.problems import random_observations, small_config
 from dreamer_spec.disk.checkpoint import FILES, open_checkpoint
-from dreamer_spec.disk.files import read_arrays, read_json, seal
+from dreamer_spec.disk.files import read_arrays, read_json
+from dreamer_spec.disk.folders import seal
 from dreamer_spec.disk.saved_agent import SavedAgent, agent_of
 from dreamer_spec.errors import UserError
 from dreamer_spec.policy import DESCRIPTION, PARAMETERS, Policy, save

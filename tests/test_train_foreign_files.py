@@ -21,7 +21,7 @@ from train_runs import Make, run_quietly
 
 from conformance.problems import small_config
 from dreamer_spec.cli import main
-from dreamer_spec.disk import checkpoint, files
+from dreamer_spec.disk import checkpoint, files, folders
 from dreamer_spec.disk.files import Unreadable
 from dreamer_spec.errors import UserError
 from dreamer_spec.replay import Replay
@@ -256,7 +256,7 @@ def test_a_buffer_that_is_lost_for_good_can_be_given_up(make: Make, capsys: pyte
 
 UNREADABLE = [
     *(
-        "checkpoints/000000000060/run.json",
+        "checkpoints/000000000060/checkpoint.json",
         "checkpoints/000000000060/learner.safetensors",
         "checkpoints/000000000060/SHA256SUMS",
     ),
@@ -351,15 +351,15 @@ def edit(
     """Changes the newest checkpoint, with checksums that agree."""
     [folder] = checkpoint.candidates(logdir)[:1]
     if info:
-        said = json.loads((folder / "run.json").read_text())
+        said = json.loads((folder / "checkpoint.json").read_text())
         info(said)
-        (folder / "run.json").write_text(json.dumps(said))
+        (folder / "checkpoint.json").write_text(json.dumps(said))
     if loop_arrays:
         arrays = files.read_arrays(folder / "loop.safetensors")
         for name, change in loop_arrays.items():
             arrays[name] = np.ascontiguousarray(change(arrays[name]))
         save_file(arrays, folder / "loop.safetensors")
-    files.seal(folder, checkpoint.FILES)
+    folders.seal(folder, checkpoint.FILES)
     return folder
 
 
@@ -442,7 +442,7 @@ def test_a_training_state_that_is_not_finite_is_refused(make: Make) -> None:
     state = files.read_arrays(folder / "learner.safetensors")
     state["params/w"][0, 0] = np.nan
     save_file(state, folder / "learner.safetensors")
-    files.seal(folder, checkpoint.FILES)
+    folders.seal(folder, checkpoint.FILES)
     assert "params/w holds numbers that are not finite" in refused(make(steps=90))
 
 
@@ -453,7 +453,7 @@ def test_an_optimizer_that_no_run_has_is_refused(make: Make, name: str, value: f
     state = files.read_arrays(folder / "learner.safetensors")
     state[name] = np.full_like(state.get(name, np.zeros((2, 3), np.float32)), value)
     save_file(state, folder / "learner.safetensors")
-    files.seal(folder, checkpoint.FILES)
+    folders.seal(folder, checkpoint.FILES)
     assert f"{name} holds numbers below 0" in refused(make(steps=90))
 
 

@@ -247,7 +247,7 @@ def test_checkpoints(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert f"{tmp_path} holds no incident" in refused(capsys, tmp_path, "--rerun")
     (path / "learner.safetensors").write_bytes(b"x" * 20)
     assert f"the checkpoint {path} is damaged: " in refused(capsys, path)
-    (path / "run.json").unlink()
+    (path / "checkpoint.json").unlink()
     assert f"the checkpoint {path} is damaged: " in refused(capsys, path)
 
 

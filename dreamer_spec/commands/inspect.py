@@ -42,7 +42,7 @@ def main(arguments: Sequence[str]) -> int:
     options = _parser().parse_args(arguments)
     console = Console(highlight=False, markup=False)
     path = options.path
-    if path.parent.name == "checkpoints" or (path / "loop.safetensors").exists():  # A log directory has a run.json too.
+    if path.parent.name == "checkpoints" or (path / "loop.safetensors").exists():
         if options.rerun:
             raise UserError(f"{path} is a checkpoint; --rerun needs an incident, which has a batch")
         _show_checkpoint(console, open_checkpoint(path))

@@ -2,47 +2,32 @@
 
 LOGDIR/checkpoints/<environment step>/
   learner.safetensors   the training state under its canonical names (spec/10-agent.md): either backend reads it
-  loop.safetensors      what the loop held: the batch drawn ahead, the records of the moment, carries, actions of the
-  episodes under way run.json              configuration, spaces, counters, and which state of LOGDIR/replay belongs to
-  it: [LOOP-21] SHA256SUMS            checksums of the other files, which `sha256sum --check` reads too
+  loop.safetensors      what the loop held: the batch drawn ahead, the records of the moment, carries, and the actions
+                        of the episodes under way
+  checkpoint.json       configuration, spaces, counters, and which state of LOGDIR/replay belongs to it: [LOOP-21]
+  SHA256SUMS            checksums of the other files, which `sha256sum --check` reads too
 """
 
 import dataclasses
 import json
 import os
 import re
-import stat
 import time
 from collections.abc import Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from safetensors import SafetensorError
-from safetensors.numpy import save_file
 
-from dreamer_spec.disk.files import (
-    SUMS,
-    Arrays,
-    Sealed,
-    entries,
-    flush,
-    free_name,
-    new_folder,
-    open_sealed,
-    reading,
-    remove_folder,
-    require_intact,
-    seal,
-)
+from dreamer_spec.disk.files import Arrays, entries, free_name, reading
+from dreamer_spec.disk.folders import SUMS, Sealed, discard, holds_any, open_sealed, require_intact, write_folder
 from dreamer_spec.errors import UserError
 from dreamer_spec.options import may_change
 
 FORMAT = 4  # Since 4 it says how the environment's values are translated: what a policy made of it needs to act.
 ONCE_COMPLETE = re.compile(r"[0-9]{12}(\.old)?")  # .old: about to be replaced by the same step
 UNFINISHED = re.compile(r"[0-9]{12}(\.old)?\.[0-9a-f]{8}\.tmp")  # being written, or being removed
-FILES = ("learner.safetensors", "loop.safetensors", "run.json")
+FILES = ("learner.safetensors", "loop.safetensors", "checkpoint.json")
 ATTEMPTS, PAUSE = 100, 0.01  # to read a checkpoint that a run replaces meanwhile; seconds between two
 
 
@@ -92,48 +77,14 @@ def save(
     Raises:
       UserError: the disk refuses it, or something else has its name.
     """
-    directory = logdir / "checkpoints"
-    final = directory / name_of(step)
-    if os.path.lexists(final) and (final.is_symlink() or not _holds_any(final)):
-        raise UserError(f"{final} is no checkpoint, and one must be written there: move it away")
-    try:
-        temporary = new_folder(final)
-        save_file(_contiguous(_single_precision(learner)), temporary / "learner.safetensors")
-        save_file(_contiguous(loop), temporary / "loop.safetensors")
-        (temporary / "run.json").write_text(json.dumps({"format": FORMAT, **info}, indent=2) + "\n", encoding="utf-8")
-        seal(temporary, FILES)
-        old = directory / f"{name_of(step)}.old"
-        if final.exists():  # The same step again, as before and after the last evaluation.
-            if old.exists():  # A process was killed before it could remove it.
-                _discard(old)
-            final.rename(old)
-        temporary.rename(final)
-        for other in _foreign(old):
-            other.rename(final / other.name)
-        flush(directory)
-        kept = [path for path in candidates(logdir) if path.suffix == ""][:keep]
-        for path in entries(directory):
-            if path not in kept and (ONCE_COMPLETE.fullmatch(path.name) or UNFINISHED.fullmatch(path.name)):
-                _discard(path)
-    except (OSError, SafetensorError) as error:
-        raise UserError(f"cannot write the checkpoint {final}: {error}") from error
+    final = logdir / "checkpoints" / name_of(step)
+    contents = _single_precision(learner), loop, {"format": FORMAT, **info}
+    write_folder(final, dict(zip(FILES, contents, strict=True)), "checkpoint")
+    kept = [path for path in candidates(logdir) if path.suffix == ""][:keep]
+    for path in entries(final.parent):
+        if path not in kept and (ONCE_COMPLETE.fullmatch(path.name) or UNFINISHED.fullmatch(path.name)):
+            discard(path, FILES)
     return final
-
-
-def _discard(path: Path) -> None:
-    """Removes a checkpoint if the system lets us and nothing else is in it. It is renamed first: nobody shall find a
-    half of it."""
-    if path.is_symlink() or not path.is_dir() or _foreign(path):
-        return
-    with suppress(OSError):
-        if not UNFINISHED.fullmatch(path.name):
-            aside = new_folder(path)
-            path = path.rename(aside)  # In the place of an empty folder.
-        remove_folder(path, (*FILES, SUMS))
-
-
-def _foreign(path: Path) -> list[Path]:
-    return [entry for entry in entries(path) if entry.name not in (*FILES, SUMS)]
 
 
 def candidates(logdir: Path) -> list[Path]:
@@ -142,20 +93,9 @@ def candidates(logdir: Path) -> list[Path]:
     Raises:
       Unreadable: the folder of the checkpoints, or one of them, cannot be looked into.
     """
-    found = [
-        path for path in entries(logdir / "checkpoints") if ONCE_COMPLETE.fullmatch(path.name) and _holds_any(path)
-    ]
+    inside = entries(logdir / "checkpoints")
+    found = [path for path in inside if ONCE_COMPLETE.fullmatch(path.name) and holds_any(path, FILES)]
     return sorted(found, key=lambda path: (path.stem, path.suffix == ""), reverse=True)
-
-
-def _holds_any(path: Path) -> bool:
-    """Whether it is a folder with one of our files at least."""
-    try:
-        with reading(path):
-            is_folder = stat.S_ISDIR(os.stat(path).st_mode)
-    except FileNotFoundError:  # It was removed meanwhile.
-        return False
-    return is_folder and any(entry.name in (*FILES, SUMS) for entry in entries(path))
 
 
 def set_aside(checkpoint: Path) -> Path:
@@ -219,7 +159,7 @@ def _identity(path: Path) -> tuple[int, int] | None:
 def _open(path: Path) -> Checkpoint:
     try:
         sealed = open_sealed(path, FILES)
-        info = sealed.json("run.json")
+        info = sealed.json("checkpoint.json")
         if info.get("format") != FORMAT:
             raise UserError(
                 f"the checkpoint {path} has format {info.get('format')!r:.80}; this version reads format {FORMAT}"
@@ -299,7 +239,3 @@ def _single_precision(arrays: Mapping[str, Any]) -> Arrays:
         name: np.asarray(array, np.float32 if np.asarray(array).dtype == np.float64 else None)
         for name, array in arrays.items()
     }
-
-
-def _contiguous(arrays: Mapping[str, Any]) -> Arrays:
-    return {name: np.array(array, order="C", copy=None) for name, array in arrays.items()}

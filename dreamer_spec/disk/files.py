@@ -1,28 +1,25 @@
-"""Folders and files: complete or absent when written, and not trusted when read.
+"""Files: complete or absent when written, and not trusted when read.
 
 Reading knows three outcomes beside success, and never takes one for another:
 
   FileNotFoundError   it is not there
-  Unreadable          it is, or may be, and cannot be read now: nothing follows from that, and nothing may be changed
-  because of it ValueError          it was read, and is not what was written: damaged
+  Unreadable          it is, or may be, and cannot be read now: nothing follows, and nothing may be changed for it
+  ValueError          it was read, and is not what was written: damaged
 
-A checksum tells an accident from what was written, not a forger from its owner: whoever changes a file can change its
-checksum too. So nothing is unpickled or run, sizes are compared before anything is allocated, and reading takes memory
-in proportion to the size of the file, whatever the file says.
+Nothing is unpickled or run, sizes are compared before anything is allocated, and reading takes memory in proportion to
+the size of the file, whatever the file says.
 
 Writing goes to a fresh name in the same folder, which is then renamed: what else lies there is neither opened, followed
 nor deleted.
 """
 
 import collections
-import dataclasses
 import errno
-import hashlib
 import json
 import os
 import secrets
 import stat
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from io import BufferedReader
 from pathlib import Path
@@ -34,7 +31,6 @@ from safetensors import SafetensorError
 
 from dreamer_spec.errors import UserError
 
-SUMS = "SHA256SUMS"
 LONGEST_TEXT = 2**20  # bytes: of a JSON file, of a list of checksums, and of the header of a safetensors file
 MOST_AXES = 8
 DTYPES = ("F64", "F32", "F16", "I64", "I32", "I16", "I8", "U64", "U32", "U16", "U8", "BOOL")
@@ -105,7 +101,7 @@ def read_text(path: Path) -> str:
       ValueError: not a file, too long, or not UTF-8.
     """
     with open_file(path) as file:
-        return _text(path, file)
+        return text_in(path, file)
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -116,7 +112,8 @@ def read_json(path: Path) -> dict[str, Any]:
       ValueError: not JSON or not an object, a name twice in one object, a whole number of more than 64 bits, too deep,
         too long.
     """
-    return _parse_json(read_text(path), path.name)
+    with open_file(path) as file:
+        return object_in(path, file)
 
 
 def read_arrays(path: Path) -> Arrays:
@@ -127,64 +124,11 @@ def read_arrays(path: Path) -> Arrays:
       ValueError: the file is not in the format, or holds arrays that NumPy does not have; the message names the file.
     """
     with open_file(path) as file:
-        return _arrays(path, file)
+        return arrays_in(path, file)
 
 
-@dataclasses.dataclass(frozen=True)
-class Sealed:
-    """A folder with all of its files open: they can be read even after somebody has replaced or removed the folder."""
-
-    path: Path
-    files: Mapping[str, BufferedReader] = dataclasses.field(repr=False, compare=False)
-
-    def json(self, name: str) -> dict[str, Any]:
-        """As read_json."""
-        return _parse_json(_text(self.path / name, self.files[name]), name)
-
-    def arrays(self, name: str) -> Arrays:
-        """As read_arrays."""
-        return _arrays(self.path / name, self.files[name])
-
-
-def open_sealed(folder: Path, names: Sequence[str]) -> Sealed:
-    """Opens the files of a folder. Their checksums are compared by `require_intact`.
-
-    Raises:
-      FileNotFoundError: the folder is not there.
-      Unreadable.
-      ValueError: a file is missing, or there is something else; the message names it.
-    """
-    with reading(folder):
-        os.stat(folder)
-    files = {}
-    for name in (*names, SUMS):
-        try:
-            files[name] = open_file(folder / name)
-        except FileNotFoundError:
-            raise ValueError(f"{name} is missing") from None
-    return Sealed(folder, files)
-
-
-def require_intact(sealed: Sealed, names: Sequence[str]) -> None:
-    """Raises:
-    Unreadable.
-    ValueError: a file is not what was written; the message names it.
-    """
-    lines = _text(sealed.path / SUMS, sealed.files[SUMS]).splitlines()
-    if [line[66:] for line in lines] != list(names):
-        raise ValueError(f"{SUMS} does not list {', '.join(names)}")
-    for line, name in zip(lines, names, strict=True):
-        if _sha256(sealed.path / name, sealed.files[name]) != line[:64]:
-            raise ValueError(f"{name} does not have the checksum in {SUMS}")
-
-
-def _sha256(path: Path, file: BufferedReader) -> str:
-    with reading(path):
-        file.seek(0)
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _text(path: Path, file: BufferedReader) -> str:
+def text_in(path: Path, file: BufferedReader) -> str:
+    """What `read_text` returns, of a file that is open."""
     with reading(path):
         file.seek(0)
         data = file.read(LONGEST_TEXT + 1)
@@ -193,9 +137,17 @@ def _text(path: Path, file: BufferedReader) -> str:
     return data.decode("utf-8")
 
 
-def _arrays(path: Path, file: BufferedReader) -> Arrays:
-    """The parser of safetensors allows a header of 100 MB, and takes the last of two arrays of one name: the header is
-    read here first."""
+def object_in(path: Path, file: BufferedReader) -> dict[str, Any]:
+    """What `read_json` returns, of a file that is open."""
+    return _parse_json(text_in(path, file), path.name)
+
+
+def arrays_in(path: Path, file: BufferedReader) -> Arrays:
+    """What `read_arrays` returns, of a file that is open.
+
+    The parser of safetensors allows a header of 100 MB, and takes the last of two arrays of one name: the header is
+    read here first.
+    """
     with reading(path):
         file.seek(0)
         length = int.from_bytes(file.read(8), "little")
@@ -294,18 +246,6 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
         raise
 
 
-def new_folder(path: Path) -> Path:
-    """A new, empty folder beside `path`, to be renamed to it: <name>.<8 hexadecimal digits>.tmp.
-
-    Raises:
-      OSError: the disk refuses it.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    folder = path.with_name(f"{path.name}.{secrets.token_hex(4)}.tmp")
-    folder.mkdir()
-    return folder
-
-
 def free_name(path: Path) -> Path:
     """`path`, or what follows of path-2, path-3, ... that is not there yet."""
     number, free = 1, path
@@ -313,33 +253,6 @@ def free_name(path: Path) -> Path:
         number += 1
         free = path.with_name(f"{path.name}-{number}")
     return free
-
-
-def remove_folder(folder: Path, names: Sequence[str]) -> None:
-    """Removes these files of a folder, and the folder if nothing else is in it. What others have put there stays.
-
-    Raises:
-      OSError: the disk refuses it.
-    """
-    if folder.is_symlink():
-        return
-    for name in names:
-        with suppress(FileNotFoundError, IsADirectoryError):
-            (folder / name).unlink()
-    with suppress(OSError):
-        folder.rmdir()
-
-
-def seal(folder: Path, names: Sequence[str]) -> None:
-    """Writes the checksums of a folder's files, which `sha256sum --check` reads too, and flushes all of it to the
-    disk."""
-    lines = []
-    for name in names:
-        with open_file(folder / name) as file:
-            lines.append(f"{_sha256(folder / name, file)}  {name}\n")
-    (folder / SUMS).write_text("".join(lines), encoding="ascii", newline="\n")
-    for path in (*(folder / name for name in names), folder / SUMS, folder):
-        flush(path)
 
 
 def flush(path: Path) -> None:

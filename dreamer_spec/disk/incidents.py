@@ -8,7 +8,6 @@ LOGDIR/nonfinite/<train step>/
 """
 
 import dataclasses
-import json
 import math
 import platform
 import re
@@ -18,11 +17,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from safetensors import SafetensorError
-from safetensors.numpy import save_file
 
 from dreamer_spec.backend import Learner
-from dreamer_spec.disk.files import SUMS, entries, flush, new_folder, open_sealed, remove_folder, require_intact, seal
+from dreamer_spec.disk.files import entries
+from dreamer_spec.disk.folders import open_sealed, require_intact, write_folder
 from dreamer_spec.errors import UserError
 
 FORMAT = 1
@@ -121,18 +119,7 @@ def save_incident(directory: Path, learner: Learner, batch: Arrays, seed: int, i
         "tensors": [dataclasses.asdict(one) for one in tallies],
     }
     final = directory / "nonfinite" / f"{info['train_step']:012d}"
-    try:
-        temporary = new_folder(final)
-        for file, arrays in zip(FILES, (state, batch), strict=False):
-            save_file({name: np.asarray(array, order="C") for name, array in arrays.items()}, temporary / file)
-        (temporary / FILES[-1]).write_text(json.dumps(incident, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-        seal(temporary, FILES)
-        if final.exists():
-            remove_folder(final, (*FILES, SUMS))
-        temporary.rename(final)
-        flush(final.parent)
-    except (OSError, SafetensorError) as error:
-        raise UserError(f"cannot write what is not finite into {final}: {error}") from error
+    write_folder(final, dict(zip(FILES, (state, batch, incident), strict=True)), "incident")
     return final
 
 

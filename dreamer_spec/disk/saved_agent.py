@@ -52,7 +52,7 @@ def agent_of(checkpoint: Checkpoint) -> SavedAgent:
     state, identity, counters = checkpoint.learner, checkpoint.info.get("identity"), checkpoint.info.get("counters")
     try:
         if not isinstance(identity, dict) or not isinstance(counters, dict):
-            raise ValueError("run.json: expected the objects identity and counters")
+            raise ValueError("checkpoint.json: expected the objects identity and counters")
         config = config_from_json({name: identity[name] for name in hyperparameters() if name in identity})
         spaces = Spaces.from_json(checkpoint.info.get("spaces"))
         translation = Translation.from_json(checkpoint.info.get("translation"), spaces)

@@ -9,7 +9,6 @@ any more is deleted when no kept save refers to it.
 
 import dataclasses
 import json
-import os
 import re
 import zlib
 from collections.abc import Iterable, Mapping
@@ -21,7 +20,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
-from dreamer_spec.disk.files import Unreadable, entries, free_name, open_file, reading, replacing
+from dreamer_spec.disk.files import Unreadable, entries, flush, free_name, open_file, reading, replacing
 from dreamer_spec.replay.chunks import chunk_numbers, chunk_path, disk_errors, next_number, numbers
 from dreamer_spec.replay.journal import Journal, journal_epochs, journal_path
 
@@ -89,7 +88,7 @@ class Epochs:
             with replacing(path) as file:
                 file.write(data)
                 journal = Journal(self.directory, epoch)  # Before the name: a state that can be restored has a journal.
-            flush_directory(self.directory)
+            flush(self.directory)
         if self.journal:
             self.journal.close()
         self.journal, self.epoch = journal, epoch
@@ -259,11 +258,3 @@ def _require_arrays(arrays: Mapping[str, NDArray[Any]], facts: Any) -> None:
             raise ValueError(f"{key} is {facts[key]!r}")
     if facts["format"] != FORMAT:
         raise ValueError(f"format {facts['format']}; this version reads {FORMAT}")
-
-
-def flush_directory(directory: Path) -> None:
-    fd = os.open(directory, os.O_RDONLY)
-    try:
-        os.fsync(fd)
-    finally:
-        os.close(fd)

@@ -106,7 +106,7 @@ class Form:
 
 def check_info(saved: Checkpoint) -> None:
     """Raises:
-    UserError: run.json lacks something, or something in it is of another kind or out of range.
+    UserError: checkpoint.json lacks something, or something in it is of another kind or out of range.
     """
     problem = next(
         iter(sorted(_VALIDATOR.iter_errors(saved.info), key=lambda error: [str(part) for part in error.absolute_path])),
@@ -114,7 +114,7 @@ def check_info(saved: Checkpoint) -> None:
     )
     if problem is not None:
         where = "/".join(map(str, problem.absolute_path)) or "the whole"
-        raise _unfit(saved, f"run.json: {where}: {problem.message:.200}")
+        raise _unfit(saved, f"checkpoint.json: {where}: {problem.message:.200}")
     counters, ratio, repeat = (
         saved.info["counters"],
         saved.info["replay_ratio"],
@@ -122,13 +122,14 @@ def check_info(saved: Checkpoint) -> None:
     )
     for name, mean in saved.info["metrics"].items():
         if mean[1] < 1:
-            raise _unfit(saved, f"run.json: metrics/{name:.50}: a mean of no value")
+            raise _unfit(saved, f"checkpoint.json: metrics/{name:.50}: a mean of no value")
     if ratio["step"] not in (None, counters["records"]):
         expected = f"expected null or the counter of records, {counters['records']}"
-        raise _unfit(saved, f"run.json: replay_ratio/step is {ratio['step']}; {expected}")
+        raise _unfit(saved, f"checkpoint.json: replay_ratio/step is {ratio['step']}; {expected}")
     if type(repeat) is not int or name_of(counters["records"] * repeat) != saved.path.name.partition(".")[0]:
         raise _unfit(
-            saved, f"run.json: counters/records is {counters['records']}, which is not the step of {saved.path.name}"
+            saved,
+            f"checkpoint.json: counters/records is {counters['records']}, which is not the step of {saved.path.name}",
         )
 
 
@@ -141,7 +142,7 @@ def check_credit(saved: Checkpoint, batch_steps: int) -> None:
         raise _unfit(
             saved,
             (
-                f"run.json: replay_ratio/credit is {credit:.40}; expected 0 or more, and "
+                f"checkpoint.json: replay_ratio/credit is {credit:.40}; expected 0 or more, and "
                 f"less than {batch_steps} time steps"
             ),
         )
