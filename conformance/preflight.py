@@ -44,7 +44,7 @@ Compared = Iterator[
 
 
 @dataclasses.dataclass(frozen=True)
-class Comparison:
+class Agreement:
     """What agreed. requirements: those that its function in the reference names. share: worst deviation as a share of
     the allowed one."""
 
@@ -64,7 +64,7 @@ class Report:
     passed: bool
     worst: float
     summary: str
-    comparisons: list[Comparison]
+    comparisons: list[Agreement]
 
 
 def _silent(what: str) -> None:
@@ -97,7 +97,7 @@ def preflight_adapter(
         try:
             for what, function in part(run, spaces, small):
                 comparisons.append(
-                    Comparison(what, re.findall(r"\[([A-Z]+-\d+)\]", function.__doc__ or ""), run.worst.share)
+                    Agreement(what, re.findall(r"\[([A-Z]+-\d+)\]", function.__doc__ or ""), run.worst.share)
                 )
                 worst, run.worst = max(worst, run.worst.deviation), Worst()
                 progress(what)

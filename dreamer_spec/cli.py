@@ -15,10 +15,11 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
+from conformance.errors import say_error
 from conformance.output import never_fail
 from dreamer_spec import arguments as keywords
 from dreamer_spec.commands import COMMANDS
-from dreamer_spec.errors import UserError, is_out_of_memory, say_error
+from dreamer_spec.errors import UserError, is_out_of_memory
 from dreamer_spec.options import (
     DEFAULT_PRESET,
     EVAL_ENV,
@@ -68,7 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with stoppable():
             return _run(sys.argv[1:] if arguments is None else arguments)
     except UserError as error:
-        say_error(error)
+        say_error("train", error)
         return 2
     except (MemoryError, RuntimeError) as error:
         if not is_out_of_memory(error):

@@ -1,29 +1,10 @@
-"""The one kind of error that `train` answers with a line instead of a traceback."""
+"""What the user can mend, which `train` answers with a line instead of a traceback; and what the system refuses."""
 
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-
-class UserError(Exception):
-    """Something that the user can mend. The message names the thing and the remedy; `train` prints it in one line and
-    exits with code 2.
-
-    details: what helps to understand it and needs its own lines, such as the traceback of an environment; printed
-    before the message.
-    """
-
-    def __init__(self, message: str, details: str = "") -> None:
-        super().__init__(message)
-        self.details = details
-
-
-def say_error(error: UserError, where: str = "") -> None:
-    """The one line of a mistake that the user can mend, on stderr."""
-    if error.details:
-        print(error.details.rstrip(), file=sys.stderr)
-    print(f"train: error: {where}{' '.join(str(error).split())}", file=sys.stderr)
+from conformance.errors import UserError
 
 
 @contextmanager

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from conformance.preflight import Comparison, Report
+from conformance.preflight import Agreement, Report
 from dreamer_spec.cli import build_parser, parse
 from dreamer_spec.disk.about import command_line, nearest, read_about, write_about
 from dreamer_spec.errors import UserError
@@ -19,7 +19,7 @@ SPACES = Spaces({"observation": Vector(4)}, {"action": Discrete((2,))})
 
 
 def write(options: Options, resumed_at: int | None = None) -> dict[str, Any]:
-    report = Report(True, 1e-7, "all agree", [Comparison("encoder", ["NET-2"], 0.25)])
+    report = Report(True, 1e-7, "all agree", [Agreement("encoder", ["NET-2"], 0.25)])
     return write_about(options, spaces=SPACES, device="cpu", parameters=123, preflight=report, resumed_at=resumed_at)
 
 

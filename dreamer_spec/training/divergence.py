@@ -6,10 +6,10 @@ import numpy as np
 from dreamer_spec.disk import checkpoint
 from dreamer_spec.disk.incidents import save_incident, stop_error
 from dreamer_spec.errors import UserError
-from dreamer_spec.training.state import Run
+from dreamer_spec.training.state import TrainingRun
 
 
-def settle(run: Run) -> None:
+def settle(run: TrainingRun) -> None:
     """Looks at the metrics of the newest train step, which must be computed or will be waited for.
 
     Raises:
@@ -36,13 +36,13 @@ def settle(run: Run) -> None:
         raise stop_error(save_incident(run.options.logdir, run.learner, step.batch, step.seed, info), info)
 
 
-def mean_metrics(run: Run) -> dict[str, float]:
+def mean_metrics(run: TrainingRun) -> dict[str, float]:
     """Means over the train steps since the last call, under `train/`."""
     settle(run)
     return {f"train/{name}": value for name, value in run.means.take().items()}
 
 
-def diverged(run: Run, what: str) -> UserError:
+def diverged(run: TrainingRun, what: str) -> UserError:
     saved = (
         f"the checkpoint in {run.options.logdir} is from before; " if checkpoint.candidates(run.options.logdir) else ""
     )
@@ -52,7 +52,7 @@ def diverged(run: Run, what: str) -> UserError:
     )
 
 
-def finite_action(run: Run, action: np.ndarray) -> np.ndarray:
+def finite_action(run: TrainingRun, action: np.ndarray) -> np.ndarray:
     """The policy's action in float32. [LOOP-12]
 
     Raises:

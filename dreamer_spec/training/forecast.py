@@ -14,7 +14,7 @@ from dreamer_spec.options import Options
 from dreamer_spec.replay.layout import TYPES, RecordLayout
 from dreamer_spec.system import cgroups
 from dreamer_spec.system.machine import physical_memory
-from dreamer_spec.training.state import Run
+from dreamer_spec.training.state import TrainingRun
 from spec import Discrete, Image, Spaces
 
 COPIES = 5  # of all parameters, in float32: themselves, the gradient, two moments, and what an update computes
@@ -99,7 +99,7 @@ class TimeForecast:
         self._begin: tuple[float, int, int, int] | None = None
         self._said = False
 
-    def attend(self, run: Run) -> None:
+    def attend(self, run: TrainingRun) -> None:
         """To be called after every step of the environments, and after the evaluation that may follow it."""
         done = run.counters
         if self._said or not run.warm or done.due:

@@ -15,7 +15,7 @@ from dreamer_spec.training.divergence import finite_action, settle
 from dreamer_spec.training.evaluation import report_failures
 from dreamer_spec.training.schedule import Schedule, evaluation_is_due, finish, log_episode
 from dreamer_spec.training.setup import prepare
-from dreamer_spec.training.state import Run, TrainStep
+from dreamer_spec.training.state import TrainingRun, TrainStep
 from reference_numpy.training_loop import can_train, derive_seed
 
 
@@ -38,7 +38,7 @@ def run(options: Options, learner: type[Learner] | None = None) -> bool:
         return train(run) and finish(run)
 
 
-def train(run: Run) -> bool:
+def train(run: TrainingRun) -> bool:
     """Acts, remembers and learns until the budget of steps is used up. Returns False if Ctrl-C ended it; then a
     checkpoint is written."""
     with stoppable() as signals, signals.polled():
@@ -67,7 +67,7 @@ def train(run: Run) -> bool:
     return not run.interrupted
 
 
-def act(run: Run, wait: bool = False) -> None:
+def act(run: TrainingRun, wait: bool = False) -> None:
     """One step of the policy in all environments, which then step on while the learner trains; or wait, where their
     episodes have ended."""
     record = run.record
@@ -85,7 +85,7 @@ def act(run: Run, wait: bool = False) -> None:
         log_episode(run, score, length, run.envs.info[worker])
 
 
-def remember_and_learn(run: Run, record: Record, action: np.ndarray, latents: Mapping[str, np.ndarray]) -> None:
+def remember_and_learn(run: TrainingRun, record: Record, action: np.ndarray, latents: Mapping[str, np.ndarray]) -> None:
     """Adds the workers' records one by one, and after each one trains as often as the replay ratio says: [LOOP-4], or
     later: [LOOP-65]."""
     with run.clock.part("replay"):
@@ -100,7 +100,7 @@ def remember_and_learn(run: Run, record: Record, action: np.ndarray, latents: Ma
                 learn(run)
 
 
-def learn(run: Run) -> None:
+def learn(run: TrainingRun) -> None:
     """One train step. The next batch is drawn meanwhile, and the latents are written back when they are computed:
     [LOOP-17]."""
     with run.clock.part("replay"):

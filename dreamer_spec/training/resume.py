@@ -22,14 +22,14 @@ from dreamer_spec.options import Options
 from dreamer_spec.replay import Replay, set_aside
 from dreamer_spec.training import saved_run
 from dreamer_spec.training.divergence import settle
-from dreamer_spec.training.state import Counters, Means, Run
+from dreamer_spec.training.state import Counters, Means, TrainingRun
 from reference_numpy.training_loop import can_train
 
 NOT_CHANGES = ("backend", "device", "logdir", "resume", "preflight", "from_")  # each start says its own
 FROM_BOUNDARY = "new episodes begin, those under way when it was saved are abandoned"
 
 
-def save(run: Run) -> Path:
+def save(run: TrainingRun) -> Path:
     """Writes a checkpoint; the environments must be waiting for actions: [LOOP-21].
 
     Raises:
@@ -181,7 +181,7 @@ def restore_environments(saved: Checkpoint, envs: Environments, display: Display
     return record
 
 
-def restore(run: Run, saved: Checkpoint, exactly: bool, own_buffer: bool = True) -> None:
+def restore(run: TrainingRun, saved: Checkpoint, exactly: bool, own_buffer: bool = True) -> None:
     """Continues where the checkpoint stopped: [LOOP-23].
 
     exactly: the environments were restored, so carries and scores go on. own_buffer: so does the batch drawn ahead;

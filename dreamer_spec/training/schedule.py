@@ -21,19 +21,19 @@ from dreamer_spec.training import resume
 from dreamer_spec.training.divergence import finite_action, mean_metrics
 from dreamer_spec.training.evaluation import Agent, Episode, Interrupted, evaluate, report_failures
 from dreamer_spec.training.forecast import TimeForecast
-from dreamer_spec.training.state import Run
+from dreamer_spec.training.state import TrainingRun
 from reference_numpy.training_loop import derive_seed
 
 
 class Schedule:
     """Does each thing when it is due."""
 
-    def __init__(self, run: Run) -> None:
+    def __init__(self, run: TrainingRun) -> None:
         self._clock = self._logged_at = self._saved_at = time.monotonic()
         self._logged = dataclasses.replace(run.counters)
         self._forecast = TimeForecast()
 
-    def attend(self, run: Run) -> None:
+    def attend(self, run: TrainingRun) -> None:
         """To be called after every step of the environments."""
         now = time.monotonic()
         run.counters.seconds += now - self._clock
@@ -45,14 +45,14 @@ class Schedule:
             self.evaluate(run)
         self._forecast.attend(run)
 
-    def evaluate(self, run: Run) -> None:
+    def evaluate(self, run: TrainingRun) -> None:
         """Plays an evaluation if one is due. To be called before the first step too: a resumed run may have been
         interrupted in one."""
         if evaluation_is_due(run) and not run.interrupted:
             with run.clock.part("evaluation"):
                 run_evaluation(run)
 
-    def save(self, run: Run) -> None:
+    def save(self, run: TrainingRun) -> None:
         """To be called while the environments wait for actions: only then can their state be saved."""
         if (
             time.monotonic() - self._saved_at >= run.options.checkpoint_every
@@ -63,7 +63,7 @@ class Schedule:
                 resume.save(run)
             self._saved_at = time.monotonic()
 
-    def _log(self, run: Run, now: float) -> None:
+    def _log(self, run: TrainingRun, now: float) -> None:
         elapsed = max(now - self._logged_at, 1e-9)
         done, before = run.counters, self._logged
         steps = (done.records - before.records) * run.options.action_repeat / elapsed
@@ -82,7 +82,7 @@ class Schedule:
             run.display.phase("prefill", len(run.replay), config.batch_size * config.batch_length, "sequences")
 
 
-def _state(run: Run) -> dict[str, float]:
+def _state(run: TrainingRun) -> dict[str, float]:
     config = run.options.config
     trained = run.counters.train_steps * config.batch_size * config.batch_length
     state = {
@@ -103,7 +103,7 @@ def _resident_memory() -> int | None:
         return None
 
 
-def _facts(run: Run, steps: float, train_steps: float) -> Iterator[str]:
+def _facts(run: TrainingRun, steps: float, train_steps: float) -> Iterator[str]:
     if run.returns:
         yield f"return {np.mean(run.returns):.4g}"
     if run.evaluation:
@@ -114,13 +114,13 @@ def _facts(run: Run, steps: float, train_steps: float) -> Iterator[str]:
     yield f"{train_steps:.1f} train steps/s"
 
 
-def evaluation_is_due(run: Run) -> bool:
+def evaluation_is_due(run: TrainingRun) -> bool:
     """Whether a multiple of --eval-every has been reached since the last evaluation; at the end `finish` evaluates."""
     every, last = run.options.eval_every, run.evaluation["step"] if run.evaluation else 0
     return every > 0 and run.step // every > last // every and run.step < run.options.steps
 
 
-def log_episode(run: Run, score: float, length: int, info: Mapping[str, float]) -> None:
+def log_episode(run: TrainingRun, score: float, length: int, info: Mapping[str, float]) -> None:
     """A training episode has ended."""
     run.counters.episodes += 1
     run.returns.append(score)
@@ -133,7 +133,7 @@ def log_episode(run: Run, score: float, length: int, info: Mapping[str, float]) 
         )
 
 
-def run_evaluation(run: Run) -> bool:
+def run_evaluation(run: TrainingRun) -> bool:
     """Plays evaluation episodes with the agent as it is. An interrupted evaluation leaves nothing behind, and False."""
     options, counters = run.options, run.counters
     if not options.eval_episodes or not run.test_envs:
@@ -181,7 +181,7 @@ def mean_info(episodes: Sequence[Episode]) -> dict[str, float]:
     }
 
 
-def show_predictions(run: Run, recorder: SequenceRecorder) -> dict[str, float]:
+def show_predictions(run: TrainingRun, recorder: SequenceRecorder) -> dict[str, float]:
     """Draws what the world model predicts of an evaluation's episodes without seeing them. Returns how far off it is,
     as metrics."""
     truth = recorder.sequences()
@@ -198,7 +198,7 @@ def show_predictions(run: Run, recorder: SequenceRecorder) -> dict[str, float]:
     return prediction_errors(spaces, truth, predicted)
 
 
-def finish(run: Run) -> bool:
+def finish(run: TrainingRun) -> bool:
     """The last evaluation, the last checkpoint, the picture, and what came of it all. Returns False if Ctrl-C ended the
     evaluation."""
     metrics = mean_metrics(run)
@@ -226,7 +226,7 @@ def finish(run: Run) -> bool:
     return True
 
 
-def say_outlook(run: Run) -> None:
+def say_outlook(run: TrainingRun) -> None:
     """Says if there is nothing to train within --steps."""
     options = run.options
     if run.step >= options.steps:

@@ -4,8 +4,9 @@
 import traceback
 from collections.abc import Callable, Sequence
 
+from conformance.errors import say_error
 from dreamer_spec.disk.about import read_about
-from dreamer_spec.errors import UserError, say_error
+from dreamer_spec.errors import UserError
 from dreamer_spec.monitoring.outcome import last_words, read_outcome, summary
 from dreamer_spec.options import Options
 
@@ -30,7 +31,7 @@ def run_all(runs: Sequence[Options], run: Callable[[Options], bool], say: Callab
         except UserError as error:
             if number == 0 and read_about(options.logdir) is None:
                 raise
-            say_error(error, f"seed {options.seed}: ")
+            say_error("train", error, f"seed {options.seed}: ")
             failed.append(options)
             continue
         except Exception:  # Not ours to know; the other seeds are not to be lost by it.

@@ -24,7 +24,7 @@ from dreamer_spec.training import resume, saved_run
 from dreamer_spec.training.evaluation import play_randomly, report_failure
 from dreamer_spec.training.forecast import say_memory
 from dreamer_spec.training.schedule import say_outlook
-from dreamer_spec.training.state import Counters, Run, Scores
+from dreamer_spec.training.state import Counters, Scores, TrainingRun
 from dreamer_spec.training.warm_start import begin_from, require_same_origin
 from dreamer_spec.words import counted
 from reference_numpy.training_loop import ReplayRatio, derive_seed
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from conformance.preflight import Report
 
 
-def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -> Run:
+def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -> TrainingRun:
     """Everything that can go wrong is tried here, the cheap things first. What must be closed is left to the stack."""
     _require_trainable(options)
     is_new = not options.logdir.exists()
@@ -79,7 +79,7 @@ def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -
         understood=envs.translation.lines,
     )
     logger = Logger(options.logdir, saved.info["log"] if saved else None, wandb=options.wandb, about=about)
-    run = Run(
+    run = TrainingRun(
         options=options,
         envs=envs,
         test_envs=test_envs,
@@ -118,7 +118,7 @@ def _understand(options: Options, saved: Checkpoint | None, envs: Environments, 
     return parameters
 
 
-def _say_start(run: Run, about: About) -> None:
+def _say_start(run: TrainingRun, about: About) -> None:
     options, say = run.options, run.display.say
     for line in run.logger.warnings:
         say(f"WARNING: {line}")
@@ -312,7 +312,7 @@ def _open_replay(
     return Prefetcher(replay, uniform, saved.info["counters"]["train_steps"] if saved else 0), record, own_buffer
 
 
-def _measure_random_policy(run: Run) -> None:
+def _measure_random_policy(run: TrainingRun) -> None:
     if run.options.random_episodes and run.test_envs:
         run.display.phase("a random policy plays")
         returns = play_randomly(run.test_envs, run.options.random_episodes, run.options.seed)

@@ -78,7 +78,7 @@ class TrainStep:
 
 
 @dataclasses.dataclass
-class Run:
+class TrainingRun:
     """Everything that a run is made of.
 
     record, carry: the newest records of the environments, and the policy's carry before it has seen them.
