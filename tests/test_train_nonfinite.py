@@ -308,11 +308,11 @@ def test_damaged_incidents_are_refused_by_name(intact: Path, tmp_path: Path, fil
     ("entry", "value", "words"),
     [
         ("format", 7, "format 7; this version reads format 1"),
-        ("seed", -1, "seed is -1"),
-        ("step", "many", "step is 'many'; expected int"),
-        ("identity", [], "identity is \\[\\]; expected dict"),
-        ("metrics", {"loss/total": "big"}, "the metric loss/total is 'big'"),
-        ("tensors", [{"kind": "gradient", "name": "x"}], "a tensor is described as {'kind': 'gradient'"),
+        ("seed", -1, "seed: -1 is less than the minimum of 0"),
+        ("step", "many", "step: 'many' is not of type 'integer'"),
+        ("identity", [], "identity: \\[\\] is not of type 'object'"),
+        ("metrics", {"loss/total": "big"}, "metrics/loss/total: 'big' is not"),
+        ("tensors", [{"kind": "gradient", "name": "x"}], "tensors/0: 'elements' is a required property"),
     ],
 )
 def test_incidents_that_say_something_else_are_refused(

@@ -334,7 +334,7 @@ ONLY = (
     "gymnasium",
     *("typing_extensions", "farama_notifications", "cloudpickle"),
 )  # Gymnasium's own needs
-OURS = ("dreamer_spec", "spec", "reference_numpy")
+OURS = ("dreamer_spec", "spec", "reference_numpy", "conformance")  # which has `UserError`
 WITHOUT_THE_REST = f"""
 import sys
 class Missing:

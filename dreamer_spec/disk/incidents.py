@@ -18,7 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from dreamer_spec.backend import Learner
+from conformance.schema import closed, misfit, validator
+from dreamer_spec.backend import Arrays, Learner
 from dreamer_spec.disk.files import entries
 from dreamer_spec.disk.folders import open_sealed, require_intact, write_folder
 from dreamer_spec.errors import UserError
@@ -26,9 +27,27 @@ from dreamer_spec.errors import UserError
 FORMAT = 1
 FILES = ("learner.safetensors", "batch.safetensors", "incident.json")
 PACKAGES = ("dreamer-spec", "jax", "jaxlib", "torch", "numpy")
-WORDS = ("nan", "inf", "-inf")  # JSON has no such numbers.
 
-Arrays = Mapping[str, np.ndarray]
+TEXT, OBJECT, COUNT = {"type": "string"}, {"type": "object"}, {"type": "integer", "minimum": 0}
+NUMBER = {"anyOf": [{"type": "number"}, {"enum": ["nan", "inf", "-inf"]}]}  # JSON has none of these three.
+METRICS = OBJECT | {"additionalProperties": NUMBER}
+TENSOR = closed(
+    {
+        "kind": {"enum": ["batch", "state", "gradient"]},
+        "name": TEXT,
+        **dict.fromkeys(("elements", "nan", "inf", "negative_inf"), COUNT),
+        "largest": {"type": ["number", "null"]},
+    }
+)
+PROPERTIES = {
+    **dict.fromkeys(("train_step", "step"), COUNT),
+    "seed": COUNT | {"maximum": 2**31 - 1},
+    **dict.fromkeys(("backend", "device"), TEXT),
+    **dict.fromkeys(("identity", "spaces", "versions"), OBJECT),
+    **dict.fromkeys(("metrics", "repeated"), METRICS),
+    "tensors": {"type": "array", "items": TENSOR},
+}
+EXPECTED = validator(OBJECT | {"properties": PROPERTIES, "required": list(PROPERTIES)})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -153,9 +172,12 @@ def load_incident(path: Path) -> Incident:
         info = sealed.json(FILES[-1])
         if info.get("format") != FORMAT:
             raise ValueError(f"format {info.get('format')!r}; this version reads format {FORMAT}")
-        _check(info)
-        metrics, repeated = _from_json(info.pop("metrics")), _from_json(info.pop("repeated"))
-        tallies = [_tally_from_json(entry) for entry in info.pop("tensors")]
+        if problem := misfit(info, EXPECTED):
+            raise ValueError(f"{FILES[-1]}: {problem}")
+        metrics, repeated = (
+            {name: float(value) for name, value in info.pop(entry).items()} for entry in ("metrics", "repeated")
+        )
+        tallies = [Tally(**entry) for entry in info.pop("tensors")]
         return Incident(path, info, metrics, repeated, tallies, sealed.arrays(FILES[0]), sealed.arrays(FILES[1]))
     except (OSError, ValueError) as error:
         raise UserError(f"the incident {path} is damaged: {error}") from error
@@ -166,45 +188,6 @@ def _versions() -> dict[str, str]:
     return {"python": platform.python_version()} | {name: installed[name] for name in PACKAGES if name in installed}
 
 
-def _check(info: Mapping[str, Any]) -> None:
-    """Raises ValueError where an entry that is read is missing or not of its kind."""
-    numbers, words, tables = (
-        ("train_step", "step", "seed"),
-        ("backend", "device"),
-        ("identity", "spaces", "versions", "metrics", "repeated"),
-    )
-    for kind, names in {int: numbers, str: words, dict: tables, list: ("tensors",)}.items():
-        for name in names:
-            if type(info.get(name)) is not kind:
-                raise ValueError(f"{FILES[-1]}: {name} is {info.get(name)!r:.80}; expected {kind.__name__}")
-    if not 0 <= info["seed"] < 2**31:
-        raise ValueError(f"{FILES[-1]}: seed is {info['seed']}; expected a number of 31 bits")
-
-
 def _to_json(metrics: Mapping[str, float]) -> dict[str, Any]:
     numbers = {name: float(value) for name, value in metrics.items()}
     return {name: value if math.isfinite(value) else str(value) for name, value in numbers.items()}
-
-
-def _from_json(metrics: Mapping[str, Any]) -> dict[str, float]:
-    for name, value in metrics.items():
-        if type(value) not in (int, float) and value not in WORDS:
-            raise ValueError(
-                f"{FILES[-1]}: the metric {name} is {value!r:.80}; expected a number or one of {', '.join(WORDS)}"
-            )
-    return {name: float(value) for name, value in metrics.items()}
-
-
-def _tally_from_json(entry: Any) -> Tally:
-    match entry:
-        case {
-            "kind": "batch" | "state" | "gradient" as kind,
-            "name": str(name),
-            "elements": int(elements),
-            "nan": int(nan),
-            "inf": int(inf),
-            "negative_inf": int(negative_inf),
-            "largest": (int() | float() | None) as largest,
-        }:
-            return Tally(kind, name, elements, nan, inf, negative_inf, largest)
-    raise ValueError(f"{FILES[-1]}: a tensor is described as {entry!r:.200}")

@@ -6,13 +6,12 @@ that names the entry, and never a traceback some steps later.
 
 import dataclasses
 import math
-from collections.abc import Mapping
 from fractions import Fraction
 from typing import Any
 
-import jsonschema
 import numpy as np
 
+from conformance.schema import closed, misfit, validator
 from dreamer_spec.disk.checkpoint import Checkpoint, name_of
 from dreamer_spec.disk.files import Arrays
 from dreamer_spec.envs.history import LONGEST
@@ -27,34 +26,30 @@ NUMBER = {"type": "finite"}
 CREDIT = r"[0-9]{1,700}(/[1-9][0-9]{0,700})?"
 
 
-def _object(properties: Mapping[str, Any]) -> dict[str, Any]:
-    return {"type": "object", "properties": properties, "required": list(properties), "additionalProperties": False}
-
-
 SCHEMA: dict[str, Any] = {
     "type": "object",
     "properties": {
         "identity": {"type": "object"},
         "spaces": {"type": "object", "additionalProperties": {"type": "object"}},
-        "translation": _object(
+        "translation": closed(
             {"observations": {"type": "object"}, "actions": {"type": "object"}, "left_out": {"type": "array"}}
         ),
         "backend": {"type": "string", "maxLength": 100},
-        "counters": _object(
+        "counters": closed(
             {name: NUMBER | {"minimum": 0} if kind is float else FAR for name, kind in Counters.__annotations__.items()}
         ),
         "environments": {
             "type": "array",
-            "items": {"anyOf": [{"type": "null"}, _object({"seed": COUNT, "episode": COUNT})]},
+            "items": {"anyOf": [{"type": "null"}, closed({"seed": COUNT, "episode": COUNT})]},
         },
-        "replay_ratio": _object(
+        "replay_ratio": closed(
             {
                 "step": {"anyOf": [{"type": "null"}, COUNT]},
                 "credit": {"type": "string", "pattern": f"^{CREDIT}$", "maxLength": 1402},
             }
         ),
         "random_return": {"anyOf": [{"type": "null"}, NUMBER]},
-        "evaluation": {"anyOf": [{"type": "null"}, _object({"step": COUNT, "return": NUMBER})]},
+        "evaluation": {"anyOf": [{"type": "null"}, closed({"step": COUNT, "return": NUMBER})]},
         "returns": {"type": "array", "items": NUMBER, "maxItems": 20},
         "metrics": {
             "type": "object",
@@ -84,13 +79,11 @@ SCHEMA: dict[str, Any] = {
         *("metrics", "log", "replay"),
     ],
 }
-_TYPES = jsonschema.Draft202012Validator.TYPE_CHECKER.redefine_many(
-    {
-        "count": lambda _, value: type(value) is int and 0 <= value < 2**63,
-        "finite": lambda _, value: type(value) in (int, float) and math.isfinite(value) and abs(value) <= 1e300,
-    }
+EXPECTED = validator(
+    SCHEMA,
+    count=lambda value: type(value) is int and 0 <= value < 2**63,
+    finite=lambda value: type(value) in (int, float) and math.isfinite(value) and abs(value) <= 1e300,
 )
-_VALIDATOR = jsonschema.validators.extend(jsonschema.Draft202012Validator, type_checker=_TYPES)(SCHEMA)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,13 +101,8 @@ def check_info(saved: Checkpoint) -> None:
     """Raises:
     UserError: checkpoint.json lacks something, or something in it is of another kind or out of range.
     """
-    problem = next(
-        iter(sorted(_VALIDATOR.iter_errors(saved.info), key=lambda error: [str(part) for part in error.absolute_path])),
-        None,
-    )
-    if problem is not None:
-        where = "/".join(map(str, problem.absolute_path)) or "the whole"
-        raise _unfit(saved, f"checkpoint.json: {where}: {problem.message:.200}")
+    if problem := misfit(saved.info, EXPECTED):
+        raise _unfit(saved, f"checkpoint.json: {problem}")
     counters, ratio, repeat = (
         saved.info["counters"],
         saved.info["replay_ratio"],
