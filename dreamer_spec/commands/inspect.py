@@ -4,7 +4,7 @@ checkpoint holds."""
 import argparse
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from dreamer_spec.backend import learner_class
+from dreamer_spec.backend import Arrays, learner_class
 from dreamer_spec.cli import Parser
 from dreamer_spec.disk.checkpoint import Checkpoint, candidates, open_checkpoint
 from dreamer_spec.disk.incidents import Incident, Tally, load_incident, newest_incident, nonfinite, offending, tally
@@ -29,8 +29,6 @@ ROWS = 12  # of a table of tensors that are not finite
 LARGEST = 5  # parameters with the largest numbers
 HUGE_INPUT = math.exp(20)  # the outermost bin: no head can predict more
 HUGE_PARAMETER = 1e3  # inputs are normalized and kernels start below 1
-
-Arrays = Mapping[str, np.ndarray]
 
 
 def main(arguments: Sequence[str]) -> int:

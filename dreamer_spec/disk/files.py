@@ -31,6 +31,7 @@ from safetensors import SafetensorError
 
 from dreamer_spec.errors import UserError
 
+BINARY = getattr(os, "O_BINARY", 0)  # of os.open: without it Windows replaces line ends
 LONGEST_TEXT = 2**20  # bytes: of a JSON file, of a list of checksums, and of the header of a safetensors file
 MOST_AXES = 8
 DTYPES = ("F64", "F32", "F16", "I64", "I32", "I16", "I8", "U64", "U32", "U16", "U8", "BOOL")
@@ -73,7 +74,7 @@ def open_file(path: Path) -> BufferedReader:
       ValueError: there is something else than a file.
     """
     with reading(path):
-        descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+        descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | BINARY)
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
         raise ValueError(f"{path.name} is not a file")
@@ -233,7 +234,7 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
     """
     require_place(path)
     name = path.with_name(f".{path.name}-{secrets.token_hex(4)}.tmp")
-    descriptor = os.open(name, os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), 0o666)
+    descriptor = os.open(name, os.O_WRONLY | os.O_CREAT | os.O_EXCL | BINARY, 0o666)
     try:
         with os.fdopen(descriptor, "wb") as file:
             yield file

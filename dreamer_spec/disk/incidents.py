@@ -12,7 +12,6 @@ import math
 import platform
 import re
 from collections.abc import Mapping
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +22,7 @@ from dreamer_spec.backend import Arrays, Learner
 from dreamer_spec.disk.files import entries
 from dreamer_spec.disk.folders import open_sealed, require_intact, write_folder
 from dreamer_spec.errors import UserError
+from dreamer_spec.system.machine import versions
 
 FORMAT = 1
 FILES = ("learner.safetensors", "batch.safetensors", "incident.json")
@@ -132,7 +132,7 @@ def save_incident(directory: Path, learner: Learner, batch: Arrays, seed: int, i
         **info,
         "seed": seed,
         "device": learner.device,
-        "versions": _versions(),
+        "versions": {"python": platform.python_version(), **versions(PACKAGES)},
         "metrics": _to_json(info["metrics"]),
         "repeated": _to_json(repeated),
         "tensors": [dataclasses.asdict(one) for one in tallies],
@@ -181,11 +181,6 @@ def load_incident(path: Path) -> Incident:
         return Incident(path, info, metrics, repeated, tallies, sealed.arrays(FILES[0]), sealed.arrays(FILES[1]))
     except (OSError, ValueError) as error:
         raise UserError(f"the incident {path} is damaged: {error}") from error
-
-
-def _versions() -> dict[str, str]:
-    installed = {distribution.name: distribution.version for distribution in metadata.distributions()}
-    return {"python": platform.python_version()} | {name: installed[name] for name in PACKAGES if name in installed}
 
 
 def _to_json(metrics: Mapping[str, float]) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from conformance.output import never_fail
 from dreamer_spec.envs.failure import describe
 from dreamer_spec.system.signals import NUMBERS
 
+CLOSING = 5.0  # seconds that environments have to close by themselves
 DYING = 5.0  # seconds that a process has to be gone after it was killed
 
 REMEDIES = {

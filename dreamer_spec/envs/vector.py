@@ -12,6 +12,7 @@ from dreamer_spec.envs.adapter import ContractEnv
 from dreamer_spec.envs.failure import Failure
 from dreamer_spec.envs.history import History, OngoingEpisode
 from dreamer_spec.envs.info import EpisodeInfo
+from dreamer_spec.envs.process import CLOSING
 from dreamer_spec.envs.stream import Step
 from dreamer_spec.envs.trial import Trial, make_here, try_out
 from dreamer_spec.envs.worker import InProcess, OwnProcess, Worker, receive
@@ -23,7 +24,6 @@ from spec import Spaces
 Record = dict[str, np.ndarray]
 
 WINDOW = 100_000  # records of all workers among which failures are counted
-CLOSING = 5.0  # seconds that environments have to close by themselves
 
 
 class Environments:

@@ -13,6 +13,7 @@ from pathlib import Path
 from dreamer_spec.errors import UserError
 from dreamer_spec.monitoring.logger import iterate_metrics
 from dreamer_spec.options import Options, names_code
+from dreamer_spec.words import counted
 
 EPISODES = 20  # of training, that stand for an evaluation where there was none
 
@@ -77,7 +78,7 @@ def read_outcome(logdir: Path) -> Outcome:
 
 def last_words(outcome: Outcome, train_steps: int | None) -> str:
     """return 187.3 ± 4.2, random 22.1 ± 1.3, ratio 8.48 ± 0.53 after 1,226 train steps"""
-    after = "" if train_steps is None else f" after {train_steps:,} train {'step' if train_steps == 1 else 'steps'}"
+    after = "" if train_steps is None else f" after {counted(train_steps, 'train step')}"
     if outcome.score is None:
         return f"no episode has ended yet{after}"
     words = {"return": outcome.score, "random": outcome.random, "ratio": outcome.ratio}
@@ -128,7 +129,7 @@ def summary(outcomes: Mapping[int, Outcome]) -> str:
     its episodes."""
     scores = [outcome.score.value for outcome in outcomes.values() if outcome.score]
     randoms = [outcome.random.value for outcome in outcomes.values() if outcome.random]
-    words = f"{len(outcomes)} {'seed' if len(outcomes) == 1 else 'seeds'}: "
+    words = f"{counted(len(outcomes), 'seed')}: "
     if not scores:
         return words + "no episode has ended yet"
     spread = f"standard deviation {statistics.stdev(scores):.2g}, " if len(scores) > 1 else ""

@@ -86,8 +86,7 @@ def _longest_episodes(is_first: np.ndarray) -> np.ndarray:
     return np.argsort(-np.where(again.any(axis=1), again.argmax(axis=1), again.shape[1]), kind="stable")
 
 
-# --- Images
-# ------------------------------------------------------------------------------
+# Images
 
 
 def _panels(truth: np.ndarray, predicted: np.ndarray) -> np.ndarray:
@@ -197,8 +196,7 @@ def _draw_strip(panels: np.ndarray, colours: np.ndarray, context: int, title: st
     return figure
 
 
-# --- Signals
-# ------------------------------------------------------------------------------
+# Signals
 
 
 @dataclasses.dataclass(frozen=True)

@@ -22,10 +22,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamer_spec.disk.files import Unreadable, entries, open_file, reading
+from dreamer_spec.disk.files import BINARY, Unreadable, entries, open_file, reading
 from dreamer_spec.errors import UserError
 from dreamer_spec.replay.layout import RecordLayout, Sections
-from dreamer_spec.replay.positioned import BINARY, most_descriptors, read_at, write_at
+from dreamer_spec.replay.positioned import most_descriptors, read_at, write_at
 
 PAGE = 4096
 MAGIC = "dreamer-spec replay chunk"

@@ -15,9 +15,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamer_spec.disk.files import open_file, reading
+from dreamer_spec.disk.files import BINARY, open_file, reading
 from dreamer_spec.replay.chunks import disk_errors, numbers, write_all
-from dreamer_spec.replay.positioned import BINARY
 
 _HEADER = struct.Struct("<QIII")
 

@@ -5,6 +5,7 @@ import os
 import platform
 import subprocess
 import time
+from collections.abc import Iterable
 from pathlib import Path
 
 PACKAGES = (
@@ -24,7 +25,7 @@ def describe() -> dict[str, object]:
         "accelerator": accelerator(),
         "system": platform.platform(),
         "python": platform.python_version(),
-        "versions": {name: version for name in PACKAGES if (version := _version(name))},
+        "versions": versions(PACKAGES),
         "commit": _commit(),
         "date": time.strftime("%Y-%m-%d"),
     }
@@ -42,6 +43,11 @@ def accelerator() -> str | None:
     """Name, memory and driver of the first NVIDIA device."""
     command = ["nvidia-smi", "--query-gpu=name,memory.total,driver_version", "--format=csv,noheader"]
     return (_output(command) or "").partition("\n")[0] or None
+
+
+def versions(packages: Iterable[str]) -> dict[str, str]:
+    """Of those that are installed."""
+    return {name: version for name in packages if (version := _version(name))}
 
 
 def own_version() -> str:
