@@ -19,7 +19,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from dreamer_spec.machine import describe
+from dreamer_spec.system.machine import describe
 
 Part = tuple[str, list[str]]
 GRACE = 20.0  # seconds that an interrupted training has for its checkpoint

@@ -21,9 +21,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, FormatStrFormatter
 
 from benchmarks.machine import command
-from dreamer_spec.curve import BLUE, GRAY, ORANGE
-from dreamer_spec.logger import iterate_metrics
-from dreamer_spec.machine import describe
+from dreamer_spec.monitoring.curve import BLUE, GRAY, ORANGE
+from dreamer_spec.monitoring.logger import iterate_metrics
+from dreamer_spec.system.machine import describe
 
 COLORS = {"jax": BLUE, "torch": ORANGE}
 EVALUATION, EPISODES = "evaluation/return", "episode/return"

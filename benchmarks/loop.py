@@ -20,8 +20,8 @@ import numpy as np
 from gymnasium import spaces as gym
 
 from benchmarks.machine import command
-from dreamer_spec.logger import iterate_metrics
-from dreamer_spec.machine import describe
+from dreamer_spec.monitoring.logger import iterate_metrics
+from dreamer_spec.system.machine import describe
 
 EPISODE = 200
 SLOW_STEP = 0.02  # seconds

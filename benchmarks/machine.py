@@ -1,4 +1,4 @@
-"""The command that is running, and how fast the machine is today. What machine it is: dreamer_spec/machine.py."""
+"""The command that is running, and how fast the machine is today. What machine it is: `dreamer_spec.system.machine`."""
 
 import shlex
 import sys

@@ -8,9 +8,9 @@ import time
 
 import numpy as np
 
-from dreamer_spec.machine import describe
+from dreamer_spec.disk.saved_agent import SavedAgent, acting_table
 from dreamer_spec.policy import Policy
-from dreamer_spec.saved_agent import SavedAgent, acting_table
+from dreamer_spec.system.machine import describe
 from dreamer_spec.translation import Entry, Translation
 from spec import Image, Spaces, Vector, load_config
 

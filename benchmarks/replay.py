@@ -25,8 +25,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.machine import command
-from dreamer_spec.machine import describe
 from dreamer_spec.replay import Replay
+from dreamer_spec.system.machine import describe
 
 WORKERS, ROWS, LENGTH = 16, 16, 64
 KINDS = {

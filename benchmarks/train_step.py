@@ -19,8 +19,8 @@ import numpy as np
 
 from benchmarks.machine import command, matrix_rate
 from dreamer_spec.backend import learner_class
-from dreamer_spec.machine import describe
-from dreamer_spec.threads import choose, spin_briefly
+from dreamer_spec.system.machine import describe
+from dreamer_spec.system.threads import choose, spin_briefly
 from spec import Config, Image, Spaces, Vector, load_config
 
 OBSERVATIONS = {"vector": {"vector": Vector(24)}, "image": {"image": Image(64, 64, 3)}}

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from rich.console import Console
 
 from conformance.commands import COMMANDS
-from conformance.errors import UserError
+from conformance.errors import UserError, say_error
 from conformance.output import never_fail
 
 
@@ -32,7 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         return modules[options.command].main(console, options)
     except UserError as error:
-        print(f"conformance: error: {error}", file=sys.stderr)
+        say_error("conformance", error)
         return 2
     except KeyboardInterrupt:
         print("conformance: interrupted", file=sys.stderr)

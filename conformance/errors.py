@@ -1,12 +1,28 @@
-"""The one kind of error that `conformance` answers with a line instead of a traceback."""
+"""The one kind of error that a command answers with a line instead of a traceback."""
 
 import stat
+import sys
 from pathlib import Path
 
 
 class UserError(Exception):
-    """Something that the user can mend. The message names the thing and the remedy; the command prints it in one line,
-    exit code 2."""
+    """Something that the user can mend. The message names the thing and the remedy; the command prints it in one line
+    and exits with code 2.
+
+    details: what helps to understand it and needs its own lines, such as the traceback of an environment; printed
+    before the message.
+    """
+
+    def __init__(self, message: str, details: str = "") -> None:
+        super().__init__(message)
+        self.details = details
+
+
+def say_error(command: str, error: UserError, where: str = "") -> None:
+    """The line on stderr. where: what the message begins with."""
+    if error.details:
+        print(error.details.rstrip(), file=sys.stderr)
+    print(f"{command}: error: {where}{' '.join(str(error).split())}", file=sys.stderr)
 
 
 def read_text(path: Path) -> str:

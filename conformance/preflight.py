@@ -47,7 +47,7 @@ Compared = Iterator[
 
 
 @dataclasses.dataclass(frozen=True)
-class Comparison:
+class Agreement:
     """What agreed. requirements: those that its function in the reference names. share: worst deviation as a share of
     the allowed one."""
 
@@ -67,7 +67,7 @@ class Report:
     passed: bool
     worst: float
     summary: str
-    comparisons: list[Comparison]
+    comparisons: list[Agreement]
 
 
 def _silent(what: str) -> None:
@@ -101,7 +101,7 @@ def preflight_adapter(
         try:
             for what, function in part(script, adapter, spaces, small):
                 agreed.append(
-                    Comparison(what, re.findall(r"\[([A-Z]+-\d+)\]", function.__doc__ or ""), comparisons.worst.share)
+                    Agreement(what, re.findall(r"\[([A-Z]+-\d+)\]", function.__doc__ or ""), comparisons.worst.share)
                 )
                 worst, comparisons.worst = max(worst, comparisons.worst.deviation), Worst()
                 progress(what)

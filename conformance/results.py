@@ -19,6 +19,7 @@ from conformance.foreign import ForeignAdapter
 from conformance.offered import offered, unchecked
 from conformance.reports.reproduce import failure
 from conformance.requirements import chapter_of, requirements
+from conformance.schema import misfit, validator
 
 FORMAT = 1
 
@@ -169,61 +170,8 @@ def read(path: Path) -> Data:
         data = json.loads(read_text(path))
     except (ValueError, RecursionError) as error:
         raise UserError(f"{path} is not JSON: {error}") from error
-    if problem := misfit(data, schema()):
+    if problem := misfit(data, validator(schema())):
         raise UserError(
             f"{path} is not a result of format {FORMAT}: {problem}; make one with: conformance check ... --json {path}"
         )
     return dict(data)
-
-
-_KINDS: dict[str, Any] = {
-    "object": dict,
-    "array": list,
-    "string": str,
-    "boolean": bool,
-    "null": type(None),
-    "number": int | float,
-}
-
-
-def misfit(value: Any, rule: Mapping[str, Any], place: str = "it") -> str:
-    """What is the first thing in a value that the schema does not allow; "" if all is well. Knows the words that our
-    schema uses."""
-    if "$ref" in rule:
-        rule = schema()["$defs"][rule["$ref"].removeprefix("#/$defs/")]
-    kinds = [rule["type"]] if isinstance(rule.get("type"), str) else rule.get("type", [])
-    if kinds and not any(_is_kind(value, kind) for kind in kinds):
-        return f"{place} must be of type {' or '.join(kinds)}"
-    if "const" in rule and value != rule["const"]:
-        return f"{place} must be {rule['const']!r}"
-    if "enum" in rule and value not in rule["enum"]:
-        return f"{place} must be one of {rule['enum']}"
-    if "anyOf" in rule:
-        problems = [misfit(value, option, place) for option in rule["anyOf"]]
-        return "" if "" in problems else problems[-1]
-    if isinstance(value, dict):
-        return _misfit_in_object(value, rule, place)
-    if isinstance(value, list) and "items" in rule:
-        return next(
-            filter(None, (misfit(entry, rule["items"], f"{place}[{index}]") for index, entry in enumerate(value))), ""
-        )
-    return ""
-
-
-def _misfit_in_object(value: Mapping[str, Any], rule: Mapping[str, Any], place: str) -> str:
-    for name in rule.get("required", ()):
-        if name not in value:
-            return f"{place} lacks {name!r}"
-    known, others = rule.get("properties", {}), rule.get("additionalProperties", {})
-    for name, entry in value.items():
-        if name not in known and others is False:
-            return f"{place} must not have {name!r}"
-        if problem := misfit(entry, known.get(name, others), f"{place}.{name}"):
-            return problem
-    return ""
-
-
-def _is_kind(value: Any, kind: str) -> bool:
-    if kind == "integer":
-        return type(value) is int
-    return isinstance(value, _KINDS[kind]) and (kind == "boolean" or not isinstance(value, bool))

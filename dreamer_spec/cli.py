@@ -1,6 +1,6 @@
 """The command `train`: options in, a run out, and one line for every mistake that the user can mend."""
 
-from dreamer_spec import before_numpy  # noqa: F401
+from dreamer_spec.system import before_numpy  # noqa: F401
 
 # isort: split
 import argparse
@@ -15,11 +15,11 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
+from conformance.errors import say_error
 from conformance.output import never_fail
 from dreamer_spec import arguments as keywords
 from dreamer_spec.commands import COMMANDS
 from dreamer_spec.errors import UserError, is_out_of_memory
-from dreamer_spec.machine import own_version
 from dreamer_spec.options import (
     DEFAULT_PRESET,
     EVAL_ENV,
@@ -34,7 +34,8 @@ from dreamer_spec.options import (
     presets,
 )
 from dreamer_spec.replay.layout import DETER_DTYPES
-from dreamer_spec.signals import stoppable
+from dreamer_spec.system.machine import own_version
+from dreamer_spec.system.signals import stoppable
 from spec import built_profiles, hyperparameters, profiles, sizes
 
 BACKENDS = ("jax", "torch")
@@ -68,7 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with stoppable():
             return _run(sys.argv[1:] if arguments is None else arguments)
     except UserError as error:
-        say_error(error)
+        say_error("train", error)
         return 2
     except (MemoryError, RuntimeError) as error:
         if not is_out_of_memory(error):
@@ -97,13 +98,6 @@ def command() -> None:
     sys.exit(code)
 
 
-def say_error(error: UserError, where: str = "") -> None:
-    """The one line of a mistake that the user can mend, on stderr."""
-    if error.details:
-        print(error.details.rstrip(), file=sys.stderr)
-    print(f"train: error: {where}{' '.join(str(error).split())}", file=sys.stderr)
-
-
 def _run(arguments: Sequence[str]) -> int:
     if arguments and not arguments[0].startswith("-"):
         name = arguments[0]
@@ -111,7 +105,10 @@ def _run(arguments: Sequence[str]) -> int:
             raise UserError(f"unknown command {name!r}{did_you_mean(name, COMMANDS)} (see train --help)")
         return importlib.import_module(f"dreamer_spec.commands.{name}").main(arguments[1:])
     runs = parse_runs(arguments)
-    from dreamer_spec import loop, seeds  # Only now: `--help` and mistakes in options shall not wait for Gymnasium.
+    from dreamer_spec.training import (
+        loop,
+        seeds,
+    )  # Only now: `--help` and mistakes in options shall not wait for Gymnasium.
 
     if len(runs) > 1:
         return seeds.run_all(runs, loop.run)

@@ -1,21 +1,10 @@
-"""The one kind of error that `train` answers with a line instead of a traceback."""
+"""What the user can mend, which `train` answers with a line instead of a traceback; and what the system refuses."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-
-class UserError(Exception):
-    """Something that the user can mend. The message names the thing and the remedy; `train` prints it in one line and
-    exits with code 2.
-
-    details: what helps to understand it and needs its own lines, such as the traceback of an environment; printed
-    before the message.
-    """
-
-    def __init__(self, message: str, details: str = "") -> None:
-        super().__init__(message)
-        self.details = details
+from conformance.errors import UserError
 
 
 @contextmanager

@@ -8,20 +8,16 @@ policy/
 """
 
 import dataclasses
-import json
 import os
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from safetensors import SafetensorError
-from safetensors.numpy import save_file
 
+from dreamer_spec.disk.folders import open_sealed, require_intact, write_folder
+from dreamer_spec.disk.saved_agent import SavedAgent, acting_table, check_info, checked_parameters, config_from_json
 from dreamer_spec.errors import UserError
-from dreamer_spec.files import SUMS, flush, new_folder, open_sealed, remove_folder, require_intact, seal
-from dreamer_spec.saved_agent import SavedAgent, acting_table, check_info, checked_parameters, config_from_json
 from dreamer_spec.translation import Translation
 from reference_numpy import agent, training_loop
 from reference_numpy.shapes import require_shape
@@ -184,31 +180,19 @@ class Policy:
 
 
 def save(path: Path, saved: SavedAgent) -> None:
-    """Writes a policy folder under another name, then renames it: it is complete or absent.
+    """Writes a policy folder, complete or not at all.
 
     Raises:
       UserError: the path exists already, or the disk refuses.
     """
     if os.path.lexists(path):
         raise UserError(f"{path} exists already; remove it, or choose another folder for the policy")
-    temporary = None
     description = {
         "format": FORMAT,
         **saved.info,
         "spaces": saved.spaces.to_json(),
         "translation": saved.translation.to_json(),
+        "config": dataclasses.asdict(saved.config),
     }
-    description["config"] = dataclasses.asdict(saved.config)
     acting = {name: saved.parameters[name] for name in acting_table(saved.config, saved.spaces)}
-    try:
-        temporary = new_folder(path)
-        save_file(acting, temporary / PARAMETERS)
-        (temporary / DESCRIPTION).write_text(json.dumps(description, indent=2) + "\n", encoding="utf-8")
-        seal(temporary, (PARAMETERS, DESCRIPTION))
-        temporary.rename(path)
-        flush(path.parent)
-    except (OSError, SafetensorError) as error:
-        if temporary:
-            with suppress(OSError):
-                remove_folder(temporary, (PARAMETERS, DESCRIPTION, SUMS))
-        raise UserError(f"cannot write the policy {path}: {error}") from error
+    write_folder(path, {PARAMETERS: acting, DESCRIPTION: description}, "policy")

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from dreamer_spec.replay import batches, buffer, items, journal, recovery, saves, storage
+from dreamer_spec.replay import batches, buffer, contents, items, journal, recovery, saves, storage
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,22 +32,23 @@ class Mistake:
         monkeypatch.setattr(self.owner, self.name, namespace[self.name])
 
 
-Storage, Items, History, Replay = storage.Storage, items.Items, saves.History, buffer.Replay
+Storage, Items, Epochs = storage.Storage, items.Items, saves.Epochs
+Contents, Replay = contents.Contents, buffer.Replay
 
 MISTAKES = [
     # The chapter.
     Mistake(
         "the queue takes the sequences 0, L, 2L",
-        Replay,
-        "add_packed",
+        Contents,
+        "append",
         "position % (self.length + 1) == 0",
         "(position + 1) % (self.length + 1) == 0",
     ),
     Mistake("item 0 is the newest", Items, "draw", "int(u * self._count)", "self._count - 1 - int(u * self._count)"),
     Mistake(
         "one item too many is kept",
-        Replay,
-        "add_packed",
+        Contents,
+        "append",
         "len(self.items) == self.capacity",
         "len(self.items) > self.capacity",
     ),
@@ -77,7 +78,7 @@ MISTAKES = [
         "span.stage.sections[-1][span.chunk_row : span.chunk_row",
     ),
     # Saving and coming back.
-    Mistake("nothing is written to the journal", Storage, "_remember", "self.history.journal.append", "len"),
+    Mistake("nothing is written to the journal", Storage, "_remember", "self.epochs.journal.append", "len"),
     Mistake(
         "staged latents are not written to the journal",
         Storage,
@@ -116,15 +117,15 @@ MISTAKES = [
     ),
     Mistake("the newest records are not written", recovery, "save", "storage.write_stage(stream)", "pass"),
     Mistake("checksums of latents grow old", recovery, "save", "storage.sum_latents(chunk)", "pass"),
-    Mistake("chunks go though a save needs them", History, "retire", "return not needed", "return True"),
+    Mistake("chunks go though a save needs them", Epochs, "retire", "return not needed", "return True"),
     Mistake(
         "journals go though a save needs them",
-        History,
+        Epochs,
         "keep",
         "epoch < min(self.kept, default=self.epoch) and epoch != self.epoch",
         "epoch != self.epoch",
     ),
-    Mistake("the journal is emptied before later ones are gone", History, "resume", "later > epoch", "False"),
+    Mistake("the journal is emptied before later ones are gone", Epochs, "resume", "later > epoch", "False"),
     Mistake(
         "a later save survives the restore", recovery, "restore", "saved_path(replay.directory, epoch).unlink()", "pass"
     ),

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from dreamer_spec import loop
-from dreamer_spec.logger import iterate_metrics
+from dreamer_spec.monitoring.logger import iterate_metrics
 from dreamer_spec.options import make_options
 from dreamer_spec.report.catalogue import find, markdown, sections
+from dreamer_spec.training import loop
 
 SPECIAL = {"memory/device", "episode/info/<key>", "evaluation/info/<key>"}  # with an accelerator, with --info-metrics
 

@@ -8,8 +8,8 @@ import pytest
 from safetensors.numpy import load, load_file, save
 
 from conformance.problems import random_batch, random_observations, random_state, small_config, spaces
-from dreamer_spec import checkpoint
 from dreamer_spec.backend import Learner, learner_class
+from dreamer_spec.disk import checkpoint
 from reference_numpy import agent as reference
 from spec import Config, Discrete, Spaces, parameter_table
 

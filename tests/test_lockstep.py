@@ -21,7 +21,7 @@ from conformance.lockstep.bounds import bound
 from conformance.lockstep.drift import GROUPS, Tensor, beyond_one, deviations, of_the_way, share_of_others
 from conformance.lockstep.report import failures, interval_ends, reduce, report
 from conformance.lockstep.run import Lockstep
-from conformance.lockstep.stream import Stream, lockstep_config
+from conformance.lockstep.stream import BatchStream, lockstep_config
 from conformance.mutants import MUTANTS, Mutant, MutantAdapter
 from conformance.problems import spaces
 from impl_jax import distributions as jax_distributions
@@ -292,7 +292,7 @@ def test_a_member_that_writes_into_its_arguments_changes_nobody_elses_step(torch
 @pytest.mark.parametrize(("observation", "action"), list(run.PROBLEMS.values()))
 def test_the_stream_holds_all_that_a_batch_can(observation: str, action: str) -> None:
     task, config = spaces(observation, action), lockstep_config("paper", "float64")
-    one, other = (Stream(3, task, config) for _ in range(2))
+    one, other = (BatchStream(3, task, config) for _ in range(2))
     batches = [one.batch(8 * number) for number in range(60)]
     again = [other.batch(8 * number) for number in range(60)]
     assert all(np.array_equal(a[name], b[name]) for a, b in zip(batches, again, strict=True) for name in a)
@@ -318,7 +318,7 @@ def test_the_stream_holds_all_that_a_batch_can(observation: str, action: str) ->
 
 def test_latents_are_the_context_of_the_next_batch() -> None:
     task, config = spaces("vector", "discrete"), lockstep_config("paper", "float64")
-    stream, rng = Stream(0, task, config), np.random.default_rng(0)
+    stream, rng = BatchStream(0, task, config), np.random.default_rng(0)
     deter, stoch = rng.normal(size=(4, 8, 32)), np.eye(6)[rng.integers(0, 6, (4, 8, 6))]
     stream.store(deter, stoch)
     batch = stream.batch(0)

@@ -15,10 +15,10 @@ import impl_jax.behavior
 import impl_torch.behavior
 from conformance.problems import random_observations, small_config
 from dreamer_spec.backend import Learner, learner_class
-from dreamer_spec.checkpoint import open_checkpoint
 from dreamer_spec.cli import main
+from dreamer_spec.disk.checkpoint import open_checkpoint
+from dreamer_spec.disk.saved_agent import agent_of
 from dreamer_spec.policy import Policy
-from dreamer_spec.saved_agent import agent_of
 from reference_numpy import behavior, networks
 from spec import Config, Discrete, Image, Spaces, Vector
 

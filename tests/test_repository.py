@@ -1,9 +1,11 @@
 """What holds for the repository as text: the grid, the one-way dependencies, citations, generated parts."""
 
 import ast
+import graphlib
 import importlib
 import inspect
 import re
+from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
@@ -102,6 +104,53 @@ def test_dependencies_point_one_way(package: str) -> None:
         allowed = MAY_IMPORT[package] | {package} | {ADAPTERS.get(path.name, package)}
         ours = imported_packages(path) & set(MAY_IMPORT)
         assert ours <= allowed, f"{path.relative_to(ROOT)} imports {sorted(ours - allowed)}"
+
+
+def modules_of_the_trainer() -> dict[str, Path]:
+    """Name inside of dreamer_spec -> file, a package under its own name."""
+    root = ROOT / "dreamer_spec"
+    paths = {".".join(path.relative_to(root).with_suffix("").parts): path for path in root.rglob("*.py")}
+    del paths["__init__"]
+    return {name.removesuffix(".__init__"): path for name, path in paths.items()}
+
+
+def imported_modules(path: Path, modules: Iterable[str]) -> set[str]:
+    """Those of dreamer_spec that a file imports anywhere, in functions and for types too."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names = {f"{node.module}.{alias.name}" for alias in node.names}
+            inside = {name for name in names if name.removeprefix("dreamer_spec.") in modules}
+            found |= inside | ({node.module} if inside != names else set())
+    return {name.removeprefix("dreamer_spec.") for name in found if name.startswith("dreamer_spec.")}
+
+
+def test_the_rooms_of_the_trainer_point_one_way() -> None:
+    """By the table in dreamer_spec/__init__.py: nothing imports from above, or from another room of its level."""
+    rows = re.findall(r"^  (\S+(?:, \S+)*)  +\S", inspect.getdoc(importlib.import_module("dreamer_spec")) or "", re.M)
+    levels = {room: level for level, row in enumerate(rows) for room in row.split(", ")}
+    modules = modules_of_the_trainer()
+
+    def room(module: str) -> str:
+        package, _, inside = module.partition(".")
+        return f"{package}.*" if inside and f"{package}.*" in levels else package
+
+    assert {room(module) for module in modules} == set(levels), "the table does not name every room once"
+    for module, path in modules.items():
+        here = room(module)
+        for other in imported_modules(path, modules):
+            assert room(other) == here or levels[room(other)] < levels[here], (
+                f"{module} imports {other}, which is not below"
+            )
+
+
+def test_no_modules_of_the_trainer_import_each_other_in_a_circle() -> None:
+    modules = modules_of_the_trainer()
+    graph = {module: imported_modules(path, modules) for module, path in modules.items()}
+    assert set().union(*graph.values()) <= set(modules), "an import of something else than a module"
+    graphlib.TopologicalSorter(graph).prepare()  # CycleError names the circle
 
 
 def test_nothing_is_unpickled() -> None:

@@ -7,19 +7,19 @@ from typing import Any
 
 import pytest
 
-from conformance.preflight import Comparison, Report
-from dreamer_spec.about import command_line, nearest, read_about, write_about
+from conformance.preflight import Agreement, Report
 from dreamer_spec.cli import build_parser, parse
+from dreamer_spec.disk.about import command_line, nearest, read_about, write_about
 from dreamer_spec.errors import UserError
-from dreamer_spec.machine import describe
 from dreamer_spec.options import Options, make_options, presets
+from dreamer_spec.system.machine import describe
 from spec import Discrete, Spaces, Vector, hyperparameters, load_config
 
 SPACES = Spaces({"observation": Vector(4)}, {"action": Discrete((2,))})
 
 
 def write(options: Options, resumed_at: int | None = None) -> dict[str, Any]:
-    report = Report(True, 1e-7, "all agree", [Comparison("encoder", ["NET-2"], 0.25)])
+    report = Report(True, 1e-7, "all agree", [Agreement("encoder", ["NET-2"], 0.25)])
     return write_about(options, spaces=SPACES, device="cpu", parameters=123, preflight=report, resumed_at=resumed_at)
 
 
@@ -138,5 +138,5 @@ def test_the_commit_is_that_of_this_code(tmp_path: Path, monkeypatch: pytest.Mon
     here = describe()["commit"]
     monkeypatch.chdir(tmp_path)
     assert describe()["commit"] == here
-    monkeypatch.setattr("dreamer_spec.machine.ROOT", tmp_path)
+    monkeypatch.setattr("dreamer_spec.system.machine.ROOT", tmp_path)
     assert describe()["commit"] is None

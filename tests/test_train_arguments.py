@@ -12,10 +12,12 @@ from train_agents import save_checkpoint
 from train_fakes import EPISODE, FakeLearner
 from train_runs import Make, logged
 
-import dreamer_spec.setup
-from dreamer_spec import about, arguments, loop
-from dreamer_spec.checkpoint import open_checkpoint
+import dreamer_spec.training.setup
+from dreamer_spec import arguments
 from dreamer_spec.cli import main, parse
+from dreamer_spec.disk import about
+from dreamer_spec.disk.checkpoint import open_checkpoint
+from dreamer_spec.disk.saved_agent import agent_of, check_info
 from dreamer_spec.envs import ContractEnv, make_env
 from dreamer_spec.envs.failure import Failure
 from dreamer_spec.envs.trial import make_here
@@ -23,7 +25,7 @@ from dreamer_spec.errors import UserError
 from dreamer_spec.policy import Policy, save
 from dreamer_spec.report.page import render
 from dreamer_spec.report.runs import read_run
-from dreamer_spec.saved_agent import agent_of, check_info
+from dreamer_spec.training import loop
 from spec import Config, Discrete, Spaces, Vector, load_config
 
 VALUES = [
@@ -259,7 +261,7 @@ CONFIG: Config = load_config("paper", "tiny", compute_dtype="float32", envs=1)
 def test_evaluation_uses_those_of_the_checkpoint_or_others(
     words: list[str], made: dict[str, Any], length: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(dreamer_spec.setup, "learner_class", lambda backend: FakeLearner)
+    monkeypatch.setattr(dreamer_spec.training.setup, "learner_class", lambda backend: FakeLearner)
     monkeypatch.setattr(FakeLearner, "load_state_dict", lambda self, state: None)
     known = make_env(TASK).translation
     arguments = {"size": 3, "name": "saved"}
@@ -275,7 +277,7 @@ def test_evaluation_uses_those_of_the_checkpoint_or_others(
 
 
 def test_another_task_has_arguments_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dreamer_spec.setup, "learner_class", lambda backend: FakeLearner)
+    monkeypatch.setattr(dreamer_spec.training.setup, "learner_class", lambda backend: FakeLearner)
     monkeypatch.setattr(FakeLearner, "load_state_dict", lambda self, state: None)
     known = make_env(TASK).translation
     checkpoint = save_checkpoint(

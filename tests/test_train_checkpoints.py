@@ -2,10 +2,7 @@
 
 import dataclasses
 import json
-import os
-import random
 import shutil
-import signal
 import subprocess
 from contextlib import ExitStack
 from pathlib import Path
@@ -15,12 +12,11 @@ import pytest
 from train_fakes import EPISODE, FakeLearner
 from train_runs import Make, batches, logged, run_quietly, stored
 
-from dreamer_spec import checkpoint, files, loop, setup
+from dreamer_spec.disk import checkpoint
 from dreamer_spec.errors import UserError
-from dreamer_spec.resume import save
+from dreamer_spec.training import loop, setup
+from dreamer_spec.training.resume import save
 from reference_numpy.training_loop import derive_seed
-
-# Checkpoints
 
 
 @pytest.mark.covers("LOOP-21", "LOOP-23")
@@ -192,7 +188,7 @@ def test_a_checkpoint_is_complete_or_absent(make: Make, monkeypatch: pytest.Monk
         raise OSError("disk full")
 
     with monkeypatch.context() as patch:
-        patch.setattr("dreamer_spec.files.flush", fail)
+        patch.setattr("dreamer_spec.disk.folders.flush", fail)
         with pytest.raises(UserError, match="disk full"):
             loop.run(make(steps=90), FakeLearner)
     assert checkpoint.open_checkpoint(make().logdir) == before
@@ -242,7 +238,7 @@ def spoil(path: Path, damage: str) -> None:
         path.unlink()
 
 
-@pytest.mark.parametrize("name", ["learner.safetensors", "loop.safetensors", "run.json", "SHA256SUMS"])
+@pytest.mark.parametrize("name", ["learner.safetensors", "loop.safetensors", "checkpoint.json", "SHA256SUMS"])
 @pytest.mark.parametrize("damage", ["cut off", "a flipped bit", "missing"])
 def test_a_damaged_checkpoint_falls_back_to_the_one_before(
     make: Make, name: str, damage: str, capsys: pytest.CaptureFixture[str]
@@ -313,57 +309,9 @@ def test_a_run_whose_checkpoints_are_all_damaged_does_not_begin_anew(make: Make)
     assert list((make().logdir / "replay").iterdir())
 
 
-def junk(rng: random.Random, depth: int = 0) -> Any:
-    kinds = [None, True, -1, 0.5, 2**62, 10**400, 1e300, float("nan"), "", "x" * 3, "1/0", [], {}]
-    return (
-        rng.choice(kinds)
-        if depth > 1 or rng.random() < 0.7
-        else [junk(rng, depth + 1)]
-        if rng.random() < 0.5
-        else {"x": junk(rng, depth + 1)}
-    )
-
-
-def forge(info: Any, rng: random.Random) -> None:
-    """Replaces, removes or adds one value somewhere in a tree of JSON."""
-    node, key = {"": info}, ""
-    while isinstance(node[key], dict | list) and node[key] and rng.random() < 0.8:
-        node = node[key]
-        key = rng.choice(list(node) if isinstance(node, dict) else range(len(node)))
-    if rng.random() < 0.2 and key != "":
-        del node[key]
-    else:
-        node[key] = junk(rng)
-
-
-def test_forged_descriptions_are_refused_or_sound(make: Make, tmp_path: Path) -> None:
-    """With right checksums, as a forger would write them. Whatever a description says: an agent that trains on, or one
-    line."""
-    options = make(task="gym:CartPole-v1", steps=40, eval_every=20, eval_episodes=1)
-    loop.run(options, FakeLearner)
-    folder = "checkpoints/000000000040"
-    description = json.loads((options.logdir / folder / "run.json").read_text())
-    rng, outcomes = random.Random(0), []
-    for number in range(120):
-        logdir = tmp_path / str(number)
-        shutil.copytree(options.logdir, logdir)
-        forged = json.loads(json.dumps(description))
-        forge(forged, rng)
-        (logdir / folder / "run.json").write_text(json.dumps(forged))
-        files.seal(logdir / folder, checkpoint.FILES)
-        try:
-            run_quietly(dataclasses.replace(options, logdir=logdir, steps=44))
-            outcomes.append("sound")
-        except UserError:
-            outcomes.append("refused")
-        shutil.rmtree(logdir)
-    assert outcomes.count("refused") > 60
-    assert outcomes.count("sound") > 10
-
-
 def test_a_checkpoint_of_another_format_is_refused(make: Make) -> None:
     loop.run(make(), FakeLearner)
-    path = make().logdir / "checkpoints" / "000000000060" / "run.json"
+    path = make().logdir / "checkpoints" / "000000000060" / "checkpoint.json"
     path.write_text(path.read_text().replace('"format": 4', '"format": 3'))
     with pytest.raises(UserError, match="format 3; this version reads format 4"):
         loop.run(make(steps=90), FakeLearner)
@@ -377,78 +325,3 @@ def test_the_newest_checkpoints_are_kept(make: Make) -> None:
     for name in names:
         path = make().logdir / "checkpoints" / name
         assert subprocess.run(["sha256sum", "--check", "--quiet", "SHA256SUMS"], cwd=path, check=False).returncode == 0
-
-
-def test_the_first_interrupt_saves(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
-    policy = FakeLearner.policy
-
-    def interrupt(self: FakeLearner, *arguments: Any) -> Any:
-        if sum(kind == "policy" for kind, _ in FakeLearner.diary) == 20:
-            os.kill(os.getpid(), signal.SIGINT)
-        return policy(self, *arguments)
-
-    handler = signal.getsignal(signal.SIGINT)
-    monkeypatch.setattr(FakeLearner, "policy", interrupt)
-    assert not loop.run(make(), FakeLearner)
-    saved = checkpoint.open_checkpoint(make().logdir)
-    assert saved
-    assert saved.info["counters"]["records"] == 42
-    assert signal.getsignal(signal.SIGINT) is handler
-
-
-@pytest.mark.covers("LOOP-23")
-@pytest.mark.parametrize("policy_step", [9, 11], ids=["in the step before", "in its second step"])
-def test_an_evaluation_that_was_interrupted_is_made_up_for(
-    make: Make, monkeypatch: pytest.MonkeyPatch, policy_step: int
-) -> None:
-    """Evaluation is due at step 20, after 10 policy steps. Metrics are then those of a run in one go."""
-    options = make(task="gym:CartPole-v1", eval_every=20, eval_episodes=4)
-    whole = dataclasses.replace(options, logdir=options.logdir / "whole")
-    loop.run(whole, FakeLearner)
-    FakeLearner.diary.clear()
-    policy = FakeLearner.policy
-
-    def interrupt(self: FakeLearner, *arguments: Any) -> Any:
-        if sum(kind == "policy" for kind, _ in FakeLearner.diary) == policy_step:
-            os.kill(os.getpid(), signal.SIGINT)
-        return policy(self, *arguments)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(FakeLearner, "policy", interrupt)
-        assert not loop.run(options, FakeLearner)
-    saved = checkpoint.open_checkpoint(options.logdir)
-    assert saved.info["counters"]["records"] == 20
-    assert (saved.info["counters"]["evaluations"], saved.info["evaluation"]) == (0, None)
-    assert not any("evaluation/return" in line for line in logged(options.logdir))
-    assert loop.run(options, FakeLearner)
-    lines, expected = (
-        [
-            {
-                name: value
-                for name, value in line.items()
-                if name != "seconds" and not name.startswith(("speed/", "time/", "memory/"))
-            }
-            for line in logged(logdir)
-        ]
-        for logdir in (options.logdir, whole.logdir)
-    )
-    assert [line["step"] for line in expected if "evaluation/return" in line] == [20, 40, 60]
-    assert lines == expected
-
-
-def test_what_ends_the_last_evaluation_does_not_cost_the_training(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*_: Any) -> list[float]:
-        raise KeyboardInterrupt
-
-    options = make(eval_episodes=2)
-    with monkeypatch.context() as patch:
-        patch.setattr("dreamer_spec.schedule.evaluate", fail)
-        with pytest.raises(KeyboardInterrupt):
-            loop.run(options, FakeLearner)
-    saved = checkpoint.open_checkpoint(options.logdir)
-    assert saved
-    assert saved.info["counters"]["records"] == 60
-    FakeLearner.diary.clear()
-    assert loop.run(options, FakeLearner)
-    assert batches() == []
-    assert any("evaluation/return" in line for line in logged(options.logdir))

@@ -14,7 +14,7 @@ import pytest
 from train_fakes import FakeLearner
 
 import dreamer_spec.commands
-import dreamer_spec.setup
+import dreamer_spec.training.setup
 from dreamer_spec.cli import build_parser, main, parse
 from dreamer_spec.commands import COMMANDS
 from dreamer_spec.errors import UserError
@@ -40,7 +40,7 @@ def fakes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Report:
     module = types.ModuleType("conformance.preflight")
     module.preflight = lambda *arguments, **options: report  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "conformance.preflight", module)
-    monkeypatch.setattr(dreamer_spec.setup, "learner_class", lambda backend: FakeLearner)
+    monkeypatch.setattr(dreamer_spec.training.setup, "learner_class", lambda backend: FakeLearner)
     monkeypatch.chdir(tmp_path)
     return report
 
@@ -103,7 +103,7 @@ def test_missing_backend(capsys: pytest.CaptureFixture[str], monkeypatch: pytest
     def learner_class(backend: str) -> Any:
         raise ModuleNotFoundError("No module named 'optax'", name="optax")
 
-    monkeypatch.setattr(dreamer_spec.setup, "learner_class", learner_class)
+    monkeypatch.setattr(dreamer_spec.training.setup, "learner_class", learner_class)
     line = refusal(capsys, *FAST, "--task", "train_fakes:Counting")
     assert "the package optax: pip install 'dreamer-spec[jax]'" in line
 

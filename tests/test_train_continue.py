@@ -13,12 +13,13 @@ from train_agents import plain_translation, random_learner_state
 from train_fakes import FakeLearner
 from train_runs import Make, batches, run_quietly
 
-import dreamer_spec.setup
-from dreamer_spec import checkpoint, loop
-from dreamer_spec.about import read_about, write_about
+import dreamer_spec.training.setup
 from dreamer_spec.cli import main
+from dreamer_spec.disk import checkpoint
+from dreamer_spec.disk.about import read_about, write_about
 from dreamer_spec.errors import UserError
 from dreamer_spec.options import Options, make_options, may_change
+from dreamer_spec.training import loop
 from impl_torch.learner import Learner as TorchLearner
 from spec import Discrete, Spaces, Vector, hyperparameters, load_config
 
@@ -38,7 +39,7 @@ SHORT = ["--steps=60", "--eval-every=0", "--eval-episodes=1", "--random-episodes
 
 @pytest.fixture
 def fakes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(dreamer_spec.setup, "learner_class", lambda backend: FakeLearner)
+    monkeypatch.setattr(dreamer_spec.training.setup, "learner_class", lambda backend: FakeLearner)
     monkeypatch.chdir(tmp_path)
     FakeLearner.diary.clear()
 

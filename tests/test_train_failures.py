@@ -14,7 +14,7 @@ from train_surroundings import is_running
 
 from dreamer_spec.envs import ContractEnv, Environments, Failure, make_env, try_out
 from dreamer_spec.errors import UserError
-from dreamer_spec.signals import stoppable
+from dreamer_spec.system.signals import stoppable
 
 TIMEOUT = 3.0  # seconds: enough to make a fake, also on a busy machine
 CALM = np.zeros((1, 2), np.float32)

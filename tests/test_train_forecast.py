@@ -10,10 +10,10 @@ import train_fakes
 from train_fakes import FakeLearner
 from train_runs import Make, run_quietly
 
-from dreamer_spec import forecast, loop
 from dreamer_spec.envs import translate
 from dreamer_spec.options import make_options
-from dreamer_spec.state import Counters
+from dreamer_spec.training import forecast, loop
+from dreamer_spec.training.state import Counters
 
 Usage = collections.namedtuple("Usage", "total used free")
 

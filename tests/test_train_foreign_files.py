@@ -2,11 +2,9 @@
 changed."""
 
 import errno
-import json
 import os
 import shutil
 import threading
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,40 +12,20 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from safetensors.numpy import save_file
 from train_agents import save_checkpoint
 from train_fakes import FakeLearner
-from train_runs import Make, run_quietly
+from train_runs import Make, content, refused, run_quietly
 
 from conformance.problems import small_config
-from dreamer_spec import checkpoint, files, forecast, loop
 from dreamer_spec.cli import main
+from dreamer_spec.disk import checkpoint
+from dreamer_spec.disk.files import Unreadable
 from dreamer_spec.errors import UserError
-from dreamer_spec.files import Unreadable
-from dreamer_spec.replay import Replay
+from dreamer_spec.training import loop
 from spec import Spaces, Vector
 
 CONFIG = small_config("paper", "float32")
 TASK = Spaces({"position": Vector(3)}, {"arm": Vector(2)})
-
-
-def content(directory: Path) -> dict[str, Any]:
-    """Every file, link and folder below a directory, with what is in it. The lock is left out: it is empty."""
-    found = {}
-    for path in sorted(directory.rglob("*")):
-        what = os.readlink(path) if path.is_symlink() else path.read_bytes() if path.is_file() else None
-        found[str(path.relative_to(directory))] = what
-    found.pop(".lock", None)
-    return found
-
-
-def refused(options: Any) -> str:
-    """The error of a run that changes nothing in its log directory."""
-    before = content(options.logdir)
-    with pytest.raises(UserError) as error:
-        loop.run(options, FakeLearner)
-    assert content(options.logdir) == before
-    return str(error.value)
 
 
 # No checkpoint, and yet something
@@ -255,7 +233,7 @@ def test_a_buffer_that_is_lost_for_good_can_be_given_up(make: Make, capsys: pyte
 
 UNREADABLE = [
     *(
-        "checkpoints/000000000060/run.json",
+        "checkpoints/000000000060/checkpoint.json",
         "checkpoints/000000000060/learner.safetensors",
         "checkpoints/000000000060/SHA256SUMS",
     ),
@@ -341,121 +319,6 @@ def test_a_checkpoint_that_is_replaced_while_it_is_read_is_not_damaged(tmp_path:
     assert not list(tmp_path.glob("checkpoints/*.damaged*"))
 
 
-# What a checkpoint says
-
-
-def edit(
-    logdir: Path, info: Callable[[dict[str, Any]], None] | None = None, loop_arrays: dict[str, Any] | None = None
-) -> Path:
-    """Changes the newest checkpoint, with checksums that agree."""
-    [folder] = checkpoint.candidates(logdir)[:1]
-    if info:
-        said = json.loads((folder / "run.json").read_text())
-        info(said)
-        (folder / "run.json").write_text(json.dumps(said))
-    if loop_arrays:
-        arrays = files.read_arrays(folder / "loop.safetensors")
-        for name, change in loop_arrays.items():
-            arrays[name] = np.ascontiguousarray(change(arrays[name]))
-        save_file(arrays, folder / "loop.safetensors")
-    files.seal(folder, checkpoint.FILES)
-    return folder
-
-
-def filled(value: float) -> Callable[[np.ndarray], np.ndarray]:
-    return lambda array: np.full_like(array, value)
-
-
-ARRAYS: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {
-    "a shape": ("drawn/reward", lambda array: array[:, :-1]),
-    "a row less": ("drawn/observation", lambda array: array[:1]),
-    "a dtype": ("drawn/is_first", lambda array: array.astype(np.float32)),
-    "another width": ("drawn/prev_action", lambda array: array.astype(np.float64)),
-    "NaN in the batch": ("drawn/prev_action", filled(np.nan)),
-    "infinite latents": ("drawn/deter", filled(np.inf)),
-    "a class out of range": ("drawn/stoch", filled(2)),
-    "a negative class": ("drawn/stoch", filled(-1)),
-    "a negative stream": ("drawn/ids", filled(-1)),
-    "scores that are NaN": ("scores/total", filled(np.nan)),
-    "a negative length": ("scores/length", filled(-1)),
-    "more workers": ("scores/length", lambda array: np.concatenate([array, array])),
-    "a carry of another shape": ("carry/steps", lambda array: array[:1]),
-    "a carry of another kind": ("carry/steps", lambda array: array.astype(np.float64)),
-    "NaN among the actions": ("actions/0", filled(np.nan)),
-    "actions of another size": ("actions/1", lambda array: array[:, :1]),
-}
-
-
-@pytest.mark.covers("LOOP-54", "REP-38")
-@pytest.mark.parametrize("what", ARRAYS)
-def test_arrays_that_no_run_has_are_refused_by_name(make: Make, what: str) -> None:
-    loop.run(make(steps=62), FakeLearner)
-    name, change = ARRAYS[what]
-    edit(make().logdir, loop_arrays={name: change})
-    before = content(make().logdir)
-    with pytest.raises(UserError, match=f"does not fit this version: .*{name.removeprefix('drawn/')}"):
-        loop.run(make(steps=90), FakeLearner)
-    if what != "another width":  # Known only when the buffer is there.
-        assert content(make().logdir) == before
-
-
-@pytest.mark.covers("LOOP-54")
-@pytest.mark.parametrize(
-    ("entry", "value"),
-    [
-        *(("counters/records", value) for value in (-1, 61, 60.0, True, 10**18, None)),
-        *(("counters/seconds", value) for value in (-1.0, float("nan"), float("inf"), "1")),
-        *(("counters/more", value) for value in (1,)),
-        *(
-            ("replay_ratio/credit", value)
-            for value in ("1e9999999", "-1", "6", "1/0", "0x1", "١", "", 3, "9" * 2000, None)
-        ),
-        *(("replay_ratio/step", value) for value in (0, 59, 61, 10**15, -1, "60", 60.0)),
-        *(("returns", value) for value in ([float("nan")], [None], [1.0] * 1000, {})),
-        *(
-            ("evaluation", value)
-            for value in ({"step": 0.5, "return": 1.0}, {"step": 1}, [], {"step": 1, "return": float("nan")})
-        ),
-        *(("metrics", value) for value in ({"x": [1.0, 0]}, {"x": [1.0]}, {"x": 1}, {"x": [1.0, 2, 3]})),
-        *(("environments", value) for value in ({}, [3], [{"seed": -1, "episode": 0}], [{"seed": 0}])),
-        *(("log", value) for value in (-1, 0.5, "0")),
-        *(("random_return", value) for value in ("1", [], float("inf"))),
-    ],
-)
-def test_counters_that_no_run_has_are_refused_by_name(make: Make, entry: str, value: Any) -> None:
-    loop.run(make(), FakeLearner)
-
-    def change(info: dict[str, Any]) -> None:
-        *path, last = entry.split("/")
-        for key in path:
-            info = info[key]
-        info[last] = value
-
-    edit(make().logdir, change)
-    assert entry.split("/")[0] in refused(make(steps=90))
-
-
-def test_a_training_state_that_is_not_finite_is_refused(make: Make) -> None:
-    loop.run(make(), FakeLearner)
-    [folder] = checkpoint.candidates(make().logdir)
-    state = files.read_arrays(folder / "learner.safetensors")
-    state["params/w"][0, 0] = np.nan
-    save_file(state, folder / "learner.safetensors")
-    files.seal(folder, checkpoint.FILES)
-    assert "params/w holds numbers that are not finite" in refused(make(steps=90))
-
-
-@pytest.mark.parametrize(("name", "value"), [("optimizer/second_moment/w", -1.0), ("optimizer/step", -5)])
-def test_an_optimizer_that_no_run_has_is_refused(make: Make, name: str, value: float) -> None:
-    loop.run(make(), FakeLearner)
-    [folder] = checkpoint.candidates(make().logdir)
-    state = files.read_arrays(folder / "learner.safetensors")
-    state[name] = np.full_like(state.get(name, np.zeros((2, 3), np.float32)), value)
-    save_file(state, folder / "learner.safetensors")
-    files.seal(folder, checkpoint.FILES)
-    assert f"{name} holds numbers below 0" in refused(make(steps=90))
-
-
 def test_what_has_the_name_of_a_checkpoint_stays_as_it_is(make: Make, tmp_path: Path) -> None:
     loop.run(make(), FakeLearner)
     (tmp_path / "mine").mkdir()
@@ -464,55 +327,6 @@ def test_what_has_the_name_of_a_checkpoint_stays_as_it_is(make: Make, tmp_path: 
     with pytest.raises(UserError, match=r"000000000090 is no checkpoint, and one must be written there: move it away"):
         loop.run(make(steps=90), FakeLearner)
     assert link.is_symlink()
-
-
-# Too large for the machine
-
-
-@pytest.mark.parametrize("task", ["Enormous", "EnormousActions"])
-def test_spaces_that_no_machine_holds_are_refused(make: Make, task: str) -> None:
-    with pytest.raises(UserError, match=r"becomes [0-9,]{13,} numbers; expected at most 1,048,576"):
-        loop.run(make(task=f"train_fakes:{task}"), FakeLearner)
-
-
-def test_a_model_that_the_machine_cannot_hold_is_refused(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(forecast, "machine_memory", lambda: 10_000)
-    with pytest.raises(
-        UserError, match=r"parameters and their optimizer take .*, and this machine gives 9\.77 KiB: .* smaller --size"
-    ):
-        loop.run(make(), FakeLearner)
-
-
-@pytest.mark.parametrize(
-    "error", [MemoryError("Unable to allocate 8.00 EiB"), RuntimeError("RESOURCE_EXHAUSTED: Out of memory")]
-)
-def test_too_little_memory_is_a_line(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], error: Exception
-) -> None:
-    def fail(*_: Any) -> bool:
-        raise error
-
-    monkeypatch.setattr(loop, "run", fail)
-    assert main(["--backend", "torch"]) == 2
-    [line] = capsys.readouterr().err.splitlines()
-    assert line.startswith(f"train: error: there is not enough memory: {error}; use a smaller --size")
-
-
-def test_the_last_checkpoint_is_intact_only_where_there_is_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: Any) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    record = {key: np.zeros((1, *shape), kind) for key, (shape, kind) in RECORD.items()}
-    monkeypatch.setattr(os, "posix_fallocate", full)
-    with pytest.raises(UserError, match=f"{tmp_path} is full; there is no checkpoint yet"):
-        Replay(10, 2, tmp_path).add_batch(record)
-
-
-RECORD: dict[str, tuple[tuple[int, ...], Any]] = {
-    **dict.fromkeys(("is_first", "is_last", "is_terminal"), ((), np.bool_)),
-    **dict.fromkeys(("x", "action", "deter"), ((2,), np.float32)),
-    **{"reward": ((), np.float32), "stoch": ((2,), np.int32)},
-}
 
 
 def test_a_log_directory_that_is_no_text_is_refused(make: Make) -> None:

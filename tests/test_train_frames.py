@@ -10,8 +10,8 @@ from gymnasium.wrappers import MaxAndSkipObservation, TimeLimit
 from train_fakes import FakeLearner
 from train_runs import Make
 
-from dreamer_spec import loop
 from dreamer_spec.envs.frames import frame_skip, repeated_twice
+from dreamer_spec.training import loop
 
 
 class Skipping(train_fakes.Counting):

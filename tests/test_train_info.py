@@ -8,11 +8,11 @@ import train_fakes
 from train_fakes import EPISODE, FakeLearner
 from train_runs import Make, logged
 
-from dreamer_spec import loop
 from dreamer_spec.envs import ContractEnv
 from dreamer_spec.envs.adapter import Garbage
 from dreamer_spec.envs.info import chosen, names_of
 from dreamer_spec.errors import UserError
+from dreamer_spec.training import loop
 
 
 class Judged(train_fakes.Counting):

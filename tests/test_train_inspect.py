@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dreamer_spec import checkpoint
 from dreamer_spec.cli import main
 from dreamer_spec.commands import inspect
-from dreamer_spec.nonfinite import save_incident
+from dreamer_spec.disk import checkpoint
+from dreamer_spec.disk.incidents import save_incident
 from dreamer_spec.options import make_options
 from spec import Config, Discrete, Spaces, Vector
 
@@ -247,7 +247,7 @@ def test_checkpoints(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert f"{tmp_path} holds no incident" in refused(capsys, tmp_path, "--rerun")
     (path / "learner.safetensors").write_bytes(b"x" * 20)
     assert f"the checkpoint {path} is damaged: " in refused(capsys, path)
-    (path / "run.json").unlink()
+    (path / "checkpoint.json").unlink()
     assert f"the checkpoint {path} is damaged: " in refused(capsys, path)
 
 
@@ -281,5 +281,5 @@ def test_incidents_that_cannot_be_repeated(
     if entry:
         content = json.loads((path / "incident.json").read_text())
         (path / "incident.json").write_text(json.dumps({**content, entry: value}))
-        monkeypatch.setattr("dreamer_spec.nonfinite.require_intact", lambda folder, names: None)
+        monkeypatch.setattr("dreamer_spec.disk.incidents.require_intact", lambda folder, names: None)
     assert words in refused(capsys, path, "--rerun")

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file
 
-from dreamer_spec import checkpoint
+from dreamer_spec.disk import checkpoint
 from dreamer_spec.replay import Replay
 
 ROOT = Path(__file__).parent.parent

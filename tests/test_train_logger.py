@@ -15,9 +15,9 @@ from PIL import Image
 from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from dreamer_spec import logger as module
 from dreamer_spec.errors import UserError
-from dreamer_spec.logger import Display, Logger, iterate_metrics
+from dreamer_spec.monitoring import logger as module
+from dreamer_spec.monitoring.logger import Display, Logger, iterate_metrics
 
 ABOUT = {
     **dict.fromkeys(("task", "backend", "device", "profile", "size", "parameters", "command", "machine"), "-"),

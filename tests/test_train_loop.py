@@ -10,10 +10,11 @@ import train_fakes
 from train_fakes import EPISODE, FakeLearner
 from train_runs import BATCH_STEPS, SMALL, Make, batches, logged, run_quietly, stored
 
-from dreamer_spec import checkpoint, evaluation, loop, setup
+from dreamer_spec.disk import checkpoint
+from dreamer_spec.disk.incidents import load_incident, newest_incident
 from dreamer_spec.envs import ContractEnv, Environments, make_env
 from dreamer_spec.errors import UserError
-from dreamer_spec.nonfinite import load_incident, newest_incident
+from dreamer_spec.training import evaluation, loop, setup
 from reference_numpy.training_loop import derive_seed
 
 # What is stored
@@ -230,7 +231,7 @@ def test_by_option_a_step_that_is_not_finite_is_skipped(make: Make, monkeypatch:
 
 
 def test_evaluation_refuses_an_action_that_is_not_finite(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("dreamer_spec.evaluation.Agent.__call__", lambda self, record: np.full((2, 2), np.nan))
+    monkeypatch.setattr("dreamer_spec.training.evaluation.Agent.__call__", lambda self, record: np.full((2, 2), np.nan))
     with pytest.raises(UserError, match="diverged: the policy's action"):
         loop.run(make(eval_episodes=2), FakeLearner)
 

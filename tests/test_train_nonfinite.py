@@ -13,8 +13,16 @@ import pytest
 from conformance.problems import random_batch, random_state, small_config, spaces
 from dreamer_spec.backend import Learner, learner_class
 from dreamer_spec.commands import inspect
+from dreamer_spec.disk.incidents import (
+    Tally,
+    load_incident,
+    newest_incident,
+    offending,
+    save_incident,
+    stop_error,
+    tally,
+)
 from dreamer_spec.errors import UserError
-from dreamer_spec.nonfinite import Tally, load_incident, newest_incident, offending, save_incident, stop_error, tally
 from reference_numpy import agent, optimizer
 from spec import parameter_table
 
@@ -300,11 +308,11 @@ def test_damaged_incidents_are_refused_by_name(intact: Path, tmp_path: Path, fil
     ("entry", "value", "words"),
     [
         ("format", 7, "format 7; this version reads format 1"),
-        ("seed", -1, "seed is -1"),
-        ("step", "many", "step is 'many'; expected int"),
-        ("identity", [], "identity is \\[\\]; expected dict"),
-        ("metrics", {"loss/total": "big"}, "the metric loss/total is 'big'"),
-        ("tensors", [{"kind": "gradient", "name": "x"}], "a tensor is described as {'kind': 'gradient'"),
+        ("seed", -1, "seed: -1 is less than the minimum of 0"),
+        ("step", "many", "step: 'many' is not of type 'integer'"),
+        ("identity", [], "identity: \\[\\] is not of type 'object'"),
+        ("metrics", {"loss/total": "big"}, "metrics/loss/total: 'big' is not"),
+        ("tensors", [{"kind": "gradient", "name": "x"}], "tensors/0: 'elements' is a required property"),
     ],
 )
 def test_incidents_that_say_something_else_are_refused(
@@ -313,6 +321,6 @@ def test_incidents_that_say_something_else_are_refused(
     copy = Path(shutil.copytree(intact, tmp_path / "incident"))
     content = json.loads((copy / "incident.json").read_text())
     (copy / "incident.json").write_text(json.dumps({**content, entry: value}))
-    monkeypatch.setattr("dreamer_spec.nonfinite.require_intact", lambda folder, names: None)
+    monkeypatch.setattr("dreamer_spec.disk.incidents.require_intact", lambda folder, names: None)
     with pytest.raises(UserError, match=words):
         load_incident(copy)

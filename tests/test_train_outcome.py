@@ -11,12 +11,13 @@ import pytest
 from train_fakes import FakeLearner
 from train_runs import SMALL, Make, logged
 
-import dreamer_spec.setup
-from dreamer_spec import loop, outcome
-from dreamer_spec.checkpoint import candidates, open_checkpoint
+import dreamer_spec.training.setup
 from dreamer_spec.cli import main, parse, parse_runs
+from dreamer_spec.disk.checkpoint import candidates, open_checkpoint
 from dreamer_spec.errors import UserError
-from dreamer_spec.outcome import Mean, Outcome, first_train_step, last_words, mean_of, read_outcome, summary
+from dreamer_spec.monitoring import outcome
+from dreamer_spec.monitoring.outcome import Mean, Outcome, first_train_step, last_words, mean_of, read_outcome, summary
+from dreamer_spec.training import loop
 
 FAST = [
     "--backend=jax",
@@ -32,7 +33,7 @@ FAST += [f"--{name.replace('_', '-')}={value}" for name, value in SMALL.items()]
 
 @pytest.fixture
 def fakes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(dreamer_spec.setup, "learner_class", lambda backend: FakeLearner)
+    monkeypatch.setattr(dreamer_spec.training.setup, "learner_class", lambda backend: FakeLearner)
     monkeypatch.chdir(tmp_path)
 
 

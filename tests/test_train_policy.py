@@ -111,7 +111,7 @@ def test_an_export_is_complete_or_absent(
         raise OSError("disk full")
 
     with monkeypatch.context() as patch:
-        patch.setattr("dreamer_spec.files.flush", fail)
+        patch.setattr("dreamer_spec.disk.folders.flush", fail)
         assert main(["export", str(checkpoint), str(tmp_path / "policy")]) == 2
     assert "disk full" in capsys.readouterr().err
     assert not (tmp_path / "policy").exists()
@@ -334,7 +334,7 @@ ONLY = (
     "gymnasium",
     *("typing_extensions", "farama_notifications", "cloudpickle"),
 )  # Gymnasium's own needs
-OURS = ("dreamer_spec", "spec", "reference_numpy")
+OURS = ("dreamer_spec", "spec", "reference_numpy", "conformance")  # which has `UserError`
 WITHOUT_THE_REST = f"""
 import sys
 class Missing:

@@ -14,14 +14,14 @@ from train_runs import logged
 import dreamer_spec.commands.eval
 from conformance.adapters import jax_adapter, torch_adapter
 from conformance.problems import Problem, random_batch, small_config, train_noise, with_sampling_margin
-from dreamer_spec import checkpoint
 from dreamer_spec.backend import learner_class
-from dreamer_spec.checkpoint import open_checkpoint
 from dreamer_spec.cli import main
 from dreamer_spec.commands.eval import sentence, summarize
+from dreamer_spec.disk import checkpoint
+from dreamer_spec.disk.checkpoint import open_checkpoint
 from dreamer_spec.envs import Environments, make_env
-from dreamer_spec.evaluation import Episode
 from dreamer_spec.replay import Replay
+from dreamer_spec.training.evaluation import Episode
 from reference_numpy import agent as reference
 from reference_numpy.training_loop import derive_seed
 from spec import Config, Discrete, Image, Spaces, Vector, parameter_table
@@ -156,7 +156,7 @@ def test_an_action_that_is_not_finite_ends_the_evaluation(
 def test_an_evaluation_shows_its_progress_and_what_failed(
     counting: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("dreamer_spec.logger.PLAIN_EVERY", 0.0)
+    monkeypatch.setattr("dreamer_spec.monitoring.logger.PLAIN_EVERY", 0.0)
     monkeypatch.setattr("dreamer_spec.envs.trial.SLOW_STEP", math.inf)  # So it is in this process.
     step, calls = train_fakes.Counting.step, []
 

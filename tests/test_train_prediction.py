@@ -14,10 +14,10 @@ from train_runs import Make, run_quietly
 from conformance.problems import random_actions, random_observations, random_parameters, small_config, spaces
 from dreamer_spec.backend import Learner, learner_class
 from dreamer_spec.envs import Environments, make_env
-from dreamer_spec.evaluation import play
-from dreamer_spec.logger import Logger
-from dreamer_spec.pictures import draw_predictions, prune_pictures
-from dreamer_spec.prediction import CONTEXT, ROWS, STEPS, SequenceRecorder, predict, prediction_errors
+from dreamer_spec.monitoring.logger import Logger
+from dreamer_spec.monitoring.pictures import draw_predictions, prune_pictures
+from dreamer_spec.monitoring.prediction import CONTEXT, ROWS, STEPS, SequenceRecorder, predict, prediction_errors
+from dreamer_spec.training.evaluation import play
 from reference_numpy.world_model import open_loop
 from spec import Discrete, Image, Spaces, Vector
 
@@ -377,7 +377,7 @@ def test_the_pictures_of_the_newest_evaluations_stay(tmp_path: Path) -> None:
 
 
 def test_a_run_keeps_the_pictures_of_its_newest_evaluations(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("dreamer_spec.pictures.KEPT", 2)
+    monkeypatch.setattr("dreamer_spec.monitoring.pictures.KEPT", 2)
     logdir = run_quietly(make(task="gym:CartPole-v1", steps=70, eval_every=20, eval_episodes=1)).options.logdir
     assert sorted(path.name for path in (logdir / "predictions").iterdir()) == [
         "000000000040-signals.png",

@@ -10,7 +10,7 @@ from replay_machine import assert_same, latents, record
 
 from dreamer_spec.replay import Replay, erase
 from dreamer_spec.replay.chunks import Shape
-from dreamer_spec.replay.layout import Layout, from_bfloat16, layout_of, to_bfloat16
+from dreamer_spec.replay.layout import RecordLayout, from_bfloat16, layout_of, to_bfloat16
 from spec import load_config, sizes
 
 LENGTH = 3
@@ -212,9 +212,9 @@ def test_a_restored_queue_forgets_what_a_smaller_buffer_has_no_room_for(tmp_path
 )
 def test_what_is_no_layout_is_refused(spoil) -> None:
     layout = layout_of(record(np.random.default_rng(0), 0), "bfloat16", 32)
-    assert Layout.from_json(layout.to_json()) == layout
+    assert RecordLayout.from_json(layout.to_json()) == layout
     with pytest.raises(ValueError, match=r"layout|lacks|deter_dtype"):
-        Layout.from_json(spoil(layout.to_json()))
+        RecordLayout.from_json(spoil(layout.to_json()))
 
 
 def test_bytes_of_a_step_are_those_of_the_chapter() -> None:

@@ -14,8 +14,8 @@ import pytest
 from html_document import Document
 from PIL import Image
 
-from dreamer_spec import checkpoint
 from dreamer_spec.cli import main
+from dreamer_spec.disk import checkpoint
 from dreamer_spec.errors import UserError
 from dreamer_spec.report import svg
 from dreamer_spec.report.page import render
@@ -223,7 +223,7 @@ def test_an_older_run_is_known_from_its_checkpoint(tmp_path: Path) -> None:
     for step, seed in (("000000000005", 7), ("000000000009", 8)):
         (path / "checkpoints" / step).mkdir(parents=True)
         identity = {"task": "gym:Old", "seed": seed, "action_repeat": 2, "image_size": 64, "units": 16}
-        (path / "checkpoints" / step / "run.json").write_text(
+        (path / "checkpoints" / step / "checkpoint.json").write_text(
             json.dumps({"identity": identity, "backend": "torch", "spaces": {}})
         )
     (path / "checkpoints" / "000000000012.tmp").mkdir()

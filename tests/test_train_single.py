@@ -10,9 +10,9 @@ import train_fakes
 from train_fakes import FakeLearner
 from train_runs import Make, batches, logged, run_quietly, stored
 
-from dreamer_spec import loop, setup
 from dreamer_spec.envs import Environments, make_env
 from dreamer_spec.errors import UserError
+from dreamer_spec.training import loop, setup
 
 RATIO = 3.0
 

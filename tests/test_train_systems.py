@@ -13,10 +13,10 @@ RUN = """
 import other_system
 import sys
 from train_fakes import FakeLearner
-import dreamer_spec.setup
+import dreamer_spec.training.setup
 from dreamer_spec.cli import main
 
-dreamer_spec.setup.learner_class = lambda backend: FakeLearner
+dreamer_spec.training.setup.learner_class = lambda backend: FakeLearner
 sys.exit(main(sys.argv[1:]))
 """
 

@@ -15,8 +15,9 @@ import train_fakes
 from train_fakes import FakeLearner
 from train_runs import Make
 
-from dreamer_spec import cgroups, loop, threads
 from dreamer_spec.envs import ContractEnv
+from dreamer_spec.system import cgroups, threads
+from dreamer_spec.training import loop
 from spec import Image, Spaces, Vector, load_config
 
 VECTORS = Spaces({"observation": Vector(3)}, {"action": Vector(1)})
@@ -143,7 +144,7 @@ USED = {
 LEARN = """
 import sys
 from spec import Spaces, Vector, load_config
-from dreamer_spec import threads
+from dreamer_spec.system import threads
 from dreamer_spec.backend import learner_class
 threads.spin_briefly()
 Learner = learner_class(sys.argv[1])
@@ -174,8 +175,8 @@ class Watching:
             import os
             print(os.environ.get("OPENBLAS_NUM_THREADS"))
 sys.meta_path.insert(0, Watching())
-import dreamer_spec.cli, dreamer_spec.threads
-print(dreamer_spec.threads.usable_cores())
+import dreamer_spec.cli, dreamer_spec.system.threads
+print(dreamer_spec.system.threads.usable_cores())
 """
     environment = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"} | given
     root = Path(__file__).parent.parent

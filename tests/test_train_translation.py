@@ -16,11 +16,11 @@ from gymnasium import spaces as gym
 from train_fakes import FakeLearner
 from train_runs import Make, run_quietly
 
-from dreamer_spec import resume, setup
 from dreamer_spec.cli import main
 from dreamer_spec.envs import ContractEnv, translate, trial
 from dreamer_spec.errors import UserError
 from dreamer_spec.policy import Policy
+from dreamer_spec.training import resume, setup
 from dreamer_spec.translation import Translation
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -14,11 +14,11 @@ from PIL import ImageSequence
 from train_agents import save_checkpoint
 from train_fakes import EPISODE, FakeLearner
 
-import dreamer_spec.setup
-from dreamer_spec import video
+import dreamer_spec.training.setup
 from dreamer_spec.cli import main
 from dreamer_spec.envs import make_env
-from dreamer_spec.video import Film
+from dreamer_spec.monitoring import video
+from dreamer_spec.monitoring.video import Film
 from spec import Config, Image, Spaces, Vector, load_config
 
 
@@ -58,7 +58,7 @@ ACTION = {"action": Vector(2)}
 @pytest.fixture
 def play(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Any:
     """Runs `train eval` on a task of this module with a learner that acts randomly: its exit code, and what it said."""
-    monkeypatch.setattr(dreamer_spec.setup, "learner_class", lambda backend: FakeLearner)
+    monkeypatch.setattr(dreamer_spec.training.setup, "learner_class", lambda backend: FakeLearner)
     monkeypatch.setattr(FakeLearner, "load_state_dict", lambda self, state: None)
 
     def run(name: str, path: str, spaces: Spaces | None = None, config: Config = CONFIG) -> tuple[int, str]:

@@ -16,7 +16,7 @@ from dreamer_spec import cli
 from dreamer_spec.envs import ContractEnv, Environments, make_env, vector
 from dreamer_spec.envs.worker import OwnProcess
 from dreamer_spec.errors import UserError
-from dreamer_spec.evaluation import play
+from dreamer_spec.training.evaluation import play
 from reference_numpy.training_loop import derive_seed
 
 SEEDS = [3, 4, 5]

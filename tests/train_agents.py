@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from conformance.problems import random_state
-from dreamer_spec import checkpoint
+from dreamer_spec.disk import checkpoint
 from dreamer_spec.options import Options
-from dreamer_spec.state import Counters
+from dreamer_spec.training.state import Counters
 from dreamer_spec.translation import Entry, Target, Translation
 from reference_numpy.agent import flatten_state
 from spec import Config, Discrete, Image, Spaces, Vector

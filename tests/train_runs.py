@@ -1,16 +1,19 @@
 """Short runs of `train` with the fake learner, for the tests that look into them."""
 
+import os
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from train_fakes import FakeLearner
 
-from dreamer_spec import loop, setup
-from dreamer_spec.logger import iterate_metrics
+from dreamer_spec.errors import UserError
+from dreamer_spec.monitoring.logger import iterate_metrics
 from dreamer_spec.options import Options
+from dreamer_spec.training import loop, setup
 
 SMALL = {
     "deter": 8,
@@ -53,3 +56,22 @@ def stored(state: Any) -> list[dict[str, np.ndarray]]:
     ends = np.cumsum(saved["streams"][:, 2])
     parts = [slice(end - count, end) for end, count in zip(ends, saved["streams"][:, 2], strict=True)]
     return [{name.removeprefix("records/"): saved[name][part] for name in keys} for part in parts]
+
+
+def content(directory: Path) -> dict[str, Any]:
+    """Every file, link and folder below a directory, with what is in it. The lock is left out: it is empty."""
+    found = {}
+    for path in sorted(directory.rglob("*")):
+        what = os.readlink(path) if path.is_symlink() else path.read_bytes() if path.is_file() else None
+        found[str(path.relative_to(directory))] = what
+    found.pop(".lock", None)
+    return found
+
+
+def refused(options: Any) -> str:
+    """The error of a run that changes nothing in its log directory."""
+    before = content(options.logdir)
+    with pytest.raises(UserError) as error:
+        loop.run(options, FakeLearner)
+    assert content(options.logdir) == before
+    return str(error.value)

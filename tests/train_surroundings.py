@@ -32,7 +32,8 @@ COMMAND = """
 import os, signal, sys
 if hasattr(signal, "SIGHUP"):
     signal.signal(signal.SIGHUP, signal.SIG_DFL)  # Under nohup it would be ignored.
-from dreamer_spec import cli, setup
+from dreamer_spec import cli
+from dreamer_spec.training import setup
 from train_fakes import FakeLearner
 from train_surroundings import arrive
 setup.learner_class = lambda backend: FakeLearner

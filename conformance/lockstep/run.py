@@ -13,7 +13,7 @@ from conformance.compare import round_to
 from conformance.errors import UserError
 from conformance.lockstep.bounds import bound
 from conformance.lockstep.drift import GROUPS, Nested, Tensor, deviations
-from conformance.lockstep.stream import Arrays, Stream, lockstep_config
+from conformance.lockstep.stream import Arrays, BatchStream, lockstep_config
 from conformance.mutants import planted
 from conformance.problems import spaces
 from reference_numpy import agent, distributions
@@ -95,7 +95,7 @@ class Lockstep:
         self.others = [name for name in members if name != self.baseline]
         self.comparisons = {name: {mode: Comparison() for mode in MODES} for name in self.others}
         self.steps = self.redrawn = 0
-        self._stream = Stream(seed, self.task, self.config)
+        self._stream = BatchStream(seed, self.task, self.config)
         self._start = self._fresh_state(seed)
         self._states: dict[str, Nested] = dict.fromkeys(members, self._start)
 

@@ -39,7 +39,7 @@ def lockstep_config(profile: str, dtype: str) -> Config:
     return load_config(profile, "tiny", compute_dtype=dtype, **SIZES)
 
 
-class Stream:
+class BatchStream:
     """Batches of a replay whose sequences follow on each other. Everything is a function of the seed and of the calls
     made."""
 

@@ -12,17 +12,17 @@ import numpy as np
 
 from dreamer_spec import arguments as keywords
 from dreamer_spec.backend import Learner
-from dreamer_spec.checkpoint import differences, open_checkpoint, space_entries
 from dreamer_spec.cli import BACKENDS, Parser
+from dreamer_spec.disk.checkpoint import differences, open_checkpoint, space_entries
+from dreamer_spec.disk.files import replacing, require_place
+from dreamer_spec.disk.saved_agent import SavedAgent, agent_of
 from dreamer_spec.envs import ContractEnv, Environments, Record, env_maker, try_out
 from dreamer_spec.errors import UserError, writing
-from dreamer_spec.evaluation import Agent, Episode, play_episodes, report_failure, report_failures
-from dreamer_spec.files import replacing, require_place
-from dreamer_spec.logger import Display
+from dreamer_spec.monitoring.logger import Display
+from dreamer_spec.monitoring.video import Film
 from dreamer_spec.options import Options, names_code
-from dreamer_spec.saved_agent import SavedAgent, agent_of
-from dreamer_spec.setup import import_learner, make_learner
-from dreamer_spec.video import Film
+from dreamer_spec.training.evaluation import Agent, Episode, play_episodes, report_failure, report_failures
+from dreamer_spec.training.setup import import_learner, make_learner
 from dreamer_spec.words import counted
 from reference_numpy.training_loop import derive_seed
 

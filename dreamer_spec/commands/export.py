@@ -4,10 +4,10 @@ docs/policy.md."""
 from collections.abc import Sequence
 from pathlib import Path
 
-from dreamer_spec.checkpoint import open_checkpoint
 from dreamer_spec.cli import Parser
+from dreamer_spec.disk.checkpoint import open_checkpoint
+from dreamer_spec.disk.saved_agent import agent_of
 from dreamer_spec.policy import save
-from dreamer_spec.saved_agent import agent_of
 
 
 def main(arguments: Sequence[str]) -> int:

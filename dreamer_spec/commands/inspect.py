@@ -4,7 +4,7 @@ checkpoint holds."""
 import argparse
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +12,11 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from dreamer_spec.backend import learner_class
-from dreamer_spec.checkpoint import Checkpoint, candidates, open_checkpoint
+from dreamer_spec.backend import Arrays, learner_class
 from dreamer_spec.cli import Parser
+from dreamer_spec.disk.checkpoint import Checkpoint, candidates, open_checkpoint
+from dreamer_spec.disk.incidents import Incident, Tally, load_incident, newest_incident, nonfinite, offending, tally
 from dreamer_spec.errors import UserError
-from dreamer_spec.nonfinite import Incident, Tally, load_incident, newest_incident, nonfinite, offending, tally
 from spec import Spaces, hyperparameters, load_config, parameter_table
 
 DESCRIPTION = """Show what a train step met whose loss or gradient was not finite, or what a checkpoint holds.
@@ -30,8 +30,6 @@ LARGEST = 5  # parameters with the largest numbers
 HUGE_INPUT = math.exp(20)  # the outermost bin: no head can predict more
 HUGE_PARAMETER = 1e3  # inputs are normalized and kernels start below 1
 
-Arrays = Mapping[str, np.ndarray]
-
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command. Returns 0, or 1 if `--rerun` was asked for and gave something else.
@@ -42,7 +40,7 @@ def main(arguments: Sequence[str]) -> int:
     options = _parser().parse_args(arguments)
     console = Console(highlight=False, markup=False)
     path = options.path
-    if path.parent.name == "checkpoints" or (path / "loop.safetensors").exists():  # A log directory has a run.json too.
+    if path.parent.name == "checkpoints" or (path / "loop.safetensors").exists():
         if options.rerun:
             raise UserError(f"{path} is a checkpoint; --rerun needs an incident, which has a batch")
         _show_checkpoint(console, open_checkpoint(path))

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from dreamer_spec.cli import Parser
+from dreamer_spec.disk.files import replacing, require_place
 from dreamer_spec.errors import writing
-from dreamer_spec.files import replacing, require_place
 from dreamer_spec.report.page import render
 from dreamer_spec.report.runs import find_logdirs, read_run
 from dreamer_spec.words import counted

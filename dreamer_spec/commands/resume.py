@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from dreamer_spec.about import read_about
-from dreamer_spec.checkpoint import candidates
 from dreamer_spec.cli import Formatter, Parser, add_options, build_parser, options_of
+from dreamer_spec.disk.about import read_about
+from dreamer_spec.disk.checkpoint import candidates
 from dreamer_spec.errors import UserError
 from dreamer_spec.options import Options, names_code
 
@@ -31,7 +31,7 @@ def main(arguments: Sequence[str]) -> int:
     """
     values = _parse(arguments)
     options = _options(values.pop("run"), {name: value for name, value in values.items() if value is not None})
-    from dreamer_spec import loop
+    from dreamer_spec.training import loop
 
     return 0 if loop.run(options) else 130
 

@@ -1,9 +1,9 @@
 """Tasks by name.
 
-gym:ID              any registered Gymnasium id, also one that a module registers: gym:CartPole-v1, gym:ALE/Pong-v5,
-gym:module:ID dmc:DOMAIN-TASK     DeepMind Control Suite from vectors: dmc:walker-walk dmc_vision:DOMAIN-TASK   the same
-from 64 x 64 images only MODULE:CALLABLE     your own: a function or class that returns a gymnasium.Env:
-my_package.my_module:make_env
+gym:ID                   any registered Gymnasium id: gym:CartPole-v1, gym:ALE/Pong-v5; of a module: gym:module:ID
+dmc:DOMAIN-TASK          DeepMind Control Suite from vectors: dmc:walker-walk
+dmc_vision:DOMAIN-TASK   the same from images only
+MODULE:CALLABLE          your own, a function or class that returns a gymnasium.Env: my_package.my_module:make_env
 """
 
 import contextlib

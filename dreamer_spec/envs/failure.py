@@ -10,7 +10,7 @@ from typing import Literal, TypeVar
 from dreamer_spec.envs.adapter import Garbage
 from dreamer_spec.envs.factory import Refusal
 from dreamer_spec.errors import UserError
-from dreamer_spec.signals import Stopped
+from dreamer_spec.system.signals import Stopped
 
 Result = TypeVar("Result")
 
@@ -80,5 +80,5 @@ def _traceback(error: BaseException) -> str:
 
 def _is_the_users(error: BaseException) -> bool:
     """A KeyboardInterrupt is an environment's own where Ctrl-C does not raise one: in worker processes, and inside
-    `dreamer_spec.signals`."""
+    `dreamer_spec.system.signals`."""
     return isinstance(error, KeyboardInterrupt) and signal.getsignal(signal.SIGINT) is signal.default_int_handler

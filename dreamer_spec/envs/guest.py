@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterator
 
 from conformance.output import open_descriptors
-from dreamer_spec import signals
+from dreamer_spec.system import signals
 
 _theirs: str | None = None  # the working directory that the guests went to, and are brought to again
 

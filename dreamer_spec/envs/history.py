@@ -26,7 +26,7 @@ class History:
         return cls(entry["seed"], entry["episode"], actions)
 
 
-class Episode:
+class OngoingEpisode:
     """An episode of one worker while it goes on. Begins before the last record of a history, which `add` then adds.
 
     records: how many it has. is_last: whether its last record ended it.
@@ -47,9 +47,9 @@ class Episode:
         self.records += 1
         self.is_last = is_last
 
-    def next(self) -> "Episode":
+    def next(self) -> "OngoingEpisode":
         """The one that follows under the same seed."""
-        return Episode(History(self.seed, self.number + 1, np.zeros((0, self._action_size), np.float32)))
+        return OngoingEpisode(History(self.seed, self.number + 1, np.zeros((0, self._action_size), np.float32)))
 
     def history(self) -> History | None:
         """None where the episode has no record yet, or more actions than are kept."""

@@ -11,8 +11,9 @@ from multiprocessing import connection
 
 from conformance.output import never_fail
 from dreamer_spec.envs.failure import describe
-from dreamer_spec.signals import NUMBERS
+from dreamer_spec.system.signals import NUMBERS
 
+CLOSING = 5.0  # seconds that environments have to close by themselves
 DYING = 5.0  # seconds that a process has to be gone after it was killed
 
 REMEDIES = {
@@ -28,7 +29,9 @@ def start_method() -> str:
     """Workers must not be forks of this process: a backend has threads in it."""
     if sys.platform == "win32":
         return "spawn"
-    multiprocessing.set_forkserver_preload(["dreamer_spec.worker_threads", "dreamer_spec.envs"])  # In this order.
+    multiprocessing.set_forkserver_preload(
+        ["dreamer_spec.system.worker_threads", "dreamer_spec.envs"]
+    )  # In this order.
     return "forkserver"
 
 

@@ -17,7 +17,7 @@ from dreamer_spec.translation import Translation
 Step = tuple[Observation, float, bool, bool, dict[str, Any]]
 
 
-class Stream(gymnasium.Env[Observation, np.ndarray]):
+class StreamEnv(gymnasium.Env[Observation, np.ndarray]):
     """The step after the end of an episode ignores its action and resets: [LOOP-11]. Nothing raises: see `_guarded`.
 
     make: index -> environment; called by the first reset, for which Gymnasium waits with a limit, as it does not for

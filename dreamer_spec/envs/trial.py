@@ -15,13 +15,12 @@ from gymnasium.vector.utils import CloudpickleWrapper
 from dreamer_spec.envs.adapter import ContractEnv
 from dreamer_spec.envs.failure import Failure, attempt
 from dreamer_spec.envs.guest import guest
-from dreamer_spec.envs.process import DYING, begin_worker, ended, no_answer, not_started, start_method
+from dreamer_spec.envs.process import CLOSING, DYING, begin_worker, ended, no_answer, not_started, start_method
 from dreamer_spec.envs.spaces import random_actions
-from dreamer_spec.signals import unbroken
+from dreamer_spec.system.signals import unbroken
 from dreamer_spec.translation import Translation
 
 SLOW_STEP = 5e-4  # seconds; from here on a process of its own is faster than taking turns
-CLOSING = 5.0  # seconds that an environment has to close by itself
 
 Make = Callable[[int], ContractEnv]
 Tell = Callable[[Failure], None]

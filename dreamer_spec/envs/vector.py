@@ -10,8 +10,9 @@ import numpy as np
 
 from dreamer_spec.envs.adapter import ContractEnv
 from dreamer_spec.envs.failure import Failure
-from dreamer_spec.envs.history import Episode, History
+from dreamer_spec.envs.history import History, OngoingEpisode
 from dreamer_spec.envs.info import EpisodeInfo
+from dreamer_spec.envs.process import CLOSING
 from dreamer_spec.envs.stream import Step
 from dreamer_spec.envs.trial import Trial, make_here, try_out
 from dreamer_spec.envs.worker import InProcess, OwnProcess, Worker, receive
@@ -23,7 +24,6 @@ from spec import Spaces
 Record = dict[str, np.ndarray]
 
 WINDOW = 100_000  # records of all workers among which failures are counted
-CLOSING = 5.0  # seconds that environments have to close by themselves
 
 
 class Environments:
@@ -75,7 +75,7 @@ class Environments:
         self.translation: Translation = known.translation
         self.spaces: Spaces = known.translation.spaces
         self.frame_skip: int = known.frame_skip
-        self._episodes: dict[int, Episode] = {}
+        self._episodes: dict[int, OngoingEpisode] = {}
         self._action = np.zeros((count, self.spaces.action_size), np.float32)
         self._pending = False  # whether actions were sent off whose records have not been asked for
         self._workers: list[Worker] = []
@@ -179,7 +179,7 @@ class Environments:
 
     def _begin(self, worker: int, history: History) -> None:
         self._workers[worker].begin(history)
-        self._episodes[worker] = Episode(history)
+        self._episodes[worker] = OngoingEpisode(history)
 
     def _receive(self) -> dict[int, Step]:
         """One step of every worker; those that fail are restarted until they give the first record of an episode:

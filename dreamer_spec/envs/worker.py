@@ -19,8 +19,8 @@ from dreamer_spec.envs.failure import Failure
 from dreamer_spec.envs.guest import guest
 from dreamer_spec.envs.history import History
 from dreamer_spec.envs.process import DYING, ended, no_answer, not_started, start_method
-from dreamer_spec.envs.stream import Step, Stream
-from dreamer_spec.signals import unbroken
+from dreamer_spec.envs.stream import Step, StreamEnv
+from dreamer_spec.system.signals import unbroken
 from dreamer_spec.translation import Translation
 
 # What Gymnasium raises where the process has ended: when something is received, when it is sent, and when that had
@@ -43,7 +43,7 @@ class InProcess:
         translation: Translation,
         env: ContractEnv | None,
     ) -> None:
-        self._make_stream = functools.partial(Stream, make, index, task, translation, os.getpid())
+        self._make_stream = functools.partial(StreamEnv, make, index, task, translation, os.getpid())
         self._stream = self._make_stream(env)
         self._work: Callable[[], Step] | None = None
 
@@ -81,7 +81,7 @@ class OwnProcess:
     def __init__(
         self, make: Callable[[int], ContractEnv], index: int, task: str, translation: Translation, timeout: float
     ) -> None:
-        self._make_stream = functools.partial(Stream, make, index, task, translation, os.getpid())
+        self._make_stream = functools.partial(StreamEnv, make, index, task, translation, os.getpid())
         self._index, self._task, self._timeout = index, task, timeout
         self._envs: AsyncVectorEnv | None = None
         self._wait: Callable[[float | None], Step] = self._wait_for_reset

@@ -5,13 +5,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamer_spec.replay.layout import LATENTS, Layout
+from dreamer_spec.replay.layout import LATENTS, RecordLayout
 from dreamer_spec.replay.storage import Storage, Stream
 
 Batch = dict[str, NDArray[Any]]
 
 
-def empty_batch(layout: Layout, rows: int, length: int) -> Batch:
+def empty_batch(layout: RecordLayout, rows: int, length: int) -> Batch:
     """New arrays of a batch of `rows` sequences with `length` trained steps each, not filled."""
     batch: Batch = {}
     for key, (dtype, shape) in layout.entries.items():
@@ -61,7 +61,7 @@ def gather(storage: Storage, chosen: list[tuple[Stream, int]], length: int, batc
     batch["deter"][...], batch["stoch"][...] = layout.unpack_latents(latents)
 
 
-def _unpack(layout: Layout, records: NDArray[Any], batch: Batch) -> None:
+def _unpack(layout: RecordLayout, records: NDArray[Any], batch: Batch) -> None:
     """Fills the entries that are stored side by side from records [B, T+1]."""
     for key in records.dtype.names or ():
         if key == "action":

@@ -1,10 +1,6 @@
 """The replay buffer of spec/11-replay.md for many records: they are on the disk, only an index and the newest are in
 memory."""
 
-import shutil
-import tempfile
-import threading
-import weakref
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -14,20 +10,13 @@ from numpy.typing import NDArray
 
 from dreamer_spec.replay import recovery
 from dreamer_spec.replay.batches import Batch, empty_batch, gather, require_same_form
-from dreamer_spec.replay.chunks import ChunkStore, Shape, disk_errors
-from dreamer_spec.replay.items import Items, require_representable
-from dreamer_spec.replay.layout import LATENTS, Layout, Packed, layout_of
-from dreamer_spec.replay.saves import History, buffer_files
-from dreamer_spec.replay.storage import Storage, Stream, state_arrays
+from dreamer_spec.replay.contents import Contents
+from dreamer_spec.replay.layout import LATENTS, Packed, layout_of
+from dreamer_spec.replay.storage import state_arrays
 from reference_numpy.shapes import require_shape
 
-CHUNK_BYTES = 2**24
-CHUNK_RECORDS = 2**14
-MEMORY_LIMIT = 2**31
-BLOCK_RECORDS = 64
 
-
-class Replay:
+class Replay(Contents):
     """Sequences of T+1 consecutive records, found by their start positions. Implements [REP-1] to [REP-34]; every
     method takes `lock`.
 
@@ -47,58 +36,6 @@ class Replay:
       ValueError: an argument out of range, or a directory that is in use.
       UserError: the disk refuses the directory.
     """
-
-    def __init__(
-        self,
-        capacity: int,
-        length: int,
-        directory: Path | None = None,
-        *,
-        memory_limit: int = MEMORY_LIMIT,
-        deter_dtype: str = "bfloat16",
-        classes: int = 256,
-        chunk_records: int | None = None,
-        block_records: int = BLOCK_RECORDS,
-        restoring: bool = False,
-    ) -> None:
-        if capacity < 1 or length < 1:
-            raise ValueError(f"capacity and length must be at least 1, got {capacity} and {length}")
-        if block_records < 1 or (chunk_records is not None and (chunk_records < 1 or chunk_records % block_records)):
-            raise ValueError(
-                f"chunk_records must be a positive multiple of block_records, got {chunk_records} and {block_records}"
-            )
-        self.capacity, self.length, self.memory_limit = capacity, length, memory_limit
-        self.deter_dtype, self.classes = deter_dtype, classes
-        self.chunk_records, self.block_records = chunk_records, block_records
-        if directory is None:
-            directory = Path(tempfile.mkdtemp(prefix="replay-"))
-            weakref.finalize(self, shutil.rmtree, directory, ignore_errors=True)
-        if not restoring:
-            with disk_errors(directory):
-                directory.mkdir(parents=True, exist_ok=True)
-            if buffer_files(directory):
-                raise ValueError(f"{directory} holds a replay buffer already: restore it, or erase it first")
-        self.directory = directory
-        self.lock = threading.RLock()
-        self.warnings: list[str] = []
-        self.history = History(directory)
-        self.storage: Storage | None = None  # made with the first record, which says what records are like
-        self.streams: dict[int, Stream] = {}
-        self.next_stream = 0
-        self.current: dict[int, int] = {}  # worker -> number of the stream it writes to
-        self.items = Items(capacity)
-
-    def clear(self) -> None:
-        """Forgets the content; saves that are kept stay restorable."""
-        for stream in self.streams.values():
-            assert self.storage is not None
-            self.storage.retire(stream, list(stream.chunks))
-        self.streams, self.current, self.next_stream = {}, {}, 0
-        self.items = Items(self.capacity)
-
-    def __len__(self) -> int:
-        """The number of items. Implements [REP-3]."""
-        return len(self.items)
 
     def add(self, step: Mapping[str, Any], worker: int) -> None:
         """Appends one record to the stream of a worker. Implements [REP-1], [REP-2], [REP-4] to [REP-7], [REP-27],
@@ -140,23 +77,7 @@ class Replay:
     def add_packed(self, packed: Packed, row: int, worker: int) -> None:
         """Appends record `row` of a pack to the stream of a worker; see `add`."""
         with self.lock:
-            storage = self.storage or self._make_storage(packed.layout)
-            number = self.current.get(worker)
-            stream = self.streams[number] if number is not None else Stream(self.next_stream)
-            position = stream.count
-            require_representable(stream.number, position)
-            storage.append(stream, packed.sections, row)
-            if number is None:
-                self.streams[stream.number] = stream
-                self.current[worker] = stream.number
-                self.next_stream += 1
-            if position - self.length >= stream.first:
-                if len(self.items) == self.capacity:
-                    self._evict()
-                item = stream.number, position - self.length
-                self.items.append(item)
-                if position % (self.length + 1) == 0:
-                    self.items.queue.append(item)
+            self.append(packed, row, worker)
 
     def sample(self, uniform: Any, online: bool = True, out: Batch | None = None) -> Batch:
         """A train batch: first from the online queue, then uniformly. Implements [REP-6], [REP-8] to [REP-18].
@@ -263,7 +184,7 @@ class Replay:
                 self.classes,
             )
             if self.storage is None or self.storage.layout != layout:
-                self._make_storage(layout)
+                self.make_storage(layout)
             assert self.storage is not None
             row = 0
             for number, first, count in np.asarray(state["streams"]).tolist():
@@ -272,7 +193,7 @@ class Replay:
                 row += count
             for number, start in np.asarray(state["items"]).tolist():
                 if len(self.items) == self.capacity:
-                    self._evict()
+                    self.evict()
                 self.items.append((number, start))
 
     def save(self, name: str) -> dict[str, Any]:
@@ -291,7 +212,7 @@ class Replay:
         """Lets go of every save but the newest of each of these names, and of the disk space that only the others
         needed."""
         with self.lock:
-            self.history.keep(names)
+            self.epochs.keep(names)
 
     @classmethod
     def restore(
@@ -323,29 +244,3 @@ class Replay:
         replay = cls(capacity, length, directory, restoring=True, **settings)
         recovery.restore(replay, description, continue_streams)
         return replay
-
-    def _make_storage(self, layout: Layout) -> Storage:
-        records = self.chunk_records or fitting_records(layout, self.capacity, self.block_records)
-        store = ChunkStore(self.directory, Shape(layout, records), self.memory_limit)
-        self.storage = Storage(store, self.block_records, self.history)
-        return self.storage
-
-    def _evict(self) -> None:
-        """A stream's items leave in the order of their starts, so exactly the record at the start is no longer
-        needed."""
-        assert self.storage is not None
-        number, start = self.items.pop_oldest()
-        stream = self.streams[number]
-        stream.first = start + 1
-        if not stream.open and stream.count - stream.first <= self.length:
-            del self.streams[number]
-            self.storage.retire(stream, list(stream.chunks))
-        elif stream.first % self.storage.records == 0:
-            self.storage.retire(stream, [stream.first // self.storage.records - 1])
-
-
-def fitting_records(layout: Layout, capacity: int, block: int) -> int:
-    """Records of a chunk: a multiple of the block, so that a chunk is neither a tiny file nor a large part of the
-    buffer."""
-    most = min(CHUNK_BYTES // layout.record_bytes, CHUNK_RECORDS, capacity // 64)
-    return max(1, most // block) * block

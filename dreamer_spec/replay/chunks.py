@@ -22,10 +22,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from dreamer_spec.disk.files import BINARY, Unreadable, entries, open_file, reading
 from dreamer_spec.errors import UserError
-from dreamer_spec.files import Unreadable, entries, open_file, reading
-from dreamer_spec.replay.layout import Layout, Sections
-from dreamer_spec.replay.positioned import BINARY, most_descriptors, read_at, write_at
+from dreamer_spec.replay.layout import RecordLayout, Sections
+from dreamer_spec.replay.positioned import most_descriptors, read_at, write_at
 
 PAGE = 4096
 MAGIC = "dreamer-spec replay chunk"
@@ -66,7 +66,7 @@ class OpenChunk:
 class Shape:
     """Where things are in a chunk file: the same for all chunks of a buffer."""
 
-    def __init__(self, layout: Layout, records: int) -> None:
+    def __init__(self, layout: RecordLayout, records: int) -> None:
         self.layout, self.records = layout, records
         self.header_bytes = _pages(len(self._header_text(2**63)))
         self.offsets: list[int] = []
@@ -230,7 +230,7 @@ class ChunkStore:
         ]
 
     @property
-    def layout(self) -> Layout:
+    def layout(self) -> RecordLayout:
         return self.shape.layout
 
     def _pieces(self, fd: int, section: int, count: int) -> Iterator[bytes]:
@@ -277,7 +277,7 @@ def is_chunk(path: Path) -> bool:
 
 @contextlib.contextmanager
 def reading_chunk(path: Path) -> Iterator[None]:
-    """As dreamer_spec.files.reading, with what to do about a file that no mending helps."""
+    """As dreamer_spec.disk.files.reading, with what to do about a file that no mending helps."""
     try:
         with reading(path):
             yield

@@ -15,15 +15,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamer_spec.files import open_file, reading
+from dreamer_spec.disk.files import BINARY, open_file, reading
 from dreamer_spec.replay.chunks import disk_errors, numbers, write_all
-from dreamer_spec.replay.positioned import BINARY
 
 _HEADER = struct.Struct("<QIII")
 
 
 @dataclasses.dataclass(frozen=True)
-class Entry:
+class JournalEntry:
     """Old latents of consecutive rows of a chunk. offset: of the bytes in the journal file."""
 
     chunk: int
@@ -82,7 +81,7 @@ def journal_epochs(directory: Path) -> list[int]:
     return numbers(directory, "journal-", ".bin")
 
 
-def entries(path: Path, row_bytes: int) -> Iterator[Entry]:
+def entries(path: Path, row_bytes: int) -> Iterator[JournalEntry]:
     """The complete entries of a journal file, oldest first.
 
     Raises:
@@ -97,10 +96,10 @@ def entries(path: Path, row_bytes: int) -> Iterator[Entry]:
             start = offset + _HEADER.size
             offset = start + rows * row_bytes
             if offset <= size:
-                yield Entry(chunk, row, rows, checksum, start)
+                yield JournalEntry(chunk, row, rows, checksum, start)
 
 
-def old_latents(path: Path, entry: Entry, row_bytes: int) -> NDArray[np.uint8] | None:
+def old_latents(path: Path, entry: JournalEntry, row_bytes: int) -> NDArray[np.uint8] | None:
     """The bytes [rows, row_bytes] of an entry, or None if its checksum disagrees."""
     with open_file(path) as file, reading(path):
         file.seek(entry.offset)

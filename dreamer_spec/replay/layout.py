@@ -37,7 +37,7 @@ _MOST_BYTES = 2**31  # of one record: nothing sensible comes near
 
 
 @dataclasses.dataclass(frozen=True)
-class Layout:
+class RecordLayout:
     """The entries of a record and where their bytes are.
 
     entries: key -> (dtype, shape) as given to and returned by the buffer. deter_dtype: "bfloat16" or "float32", how
@@ -156,7 +156,7 @@ class Layout:
         return {"entries": entries, "deter_dtype": self.deter_dtype, "classes": self.classes}
 
     @classmethod
-    def from_json(cls, data: Any) -> "Layout":
+    def from_json(cls, data: Any) -> "RecordLayout":
         """Raises:
         ValueError: anything else than `to_json` gives.
         """
@@ -176,11 +176,11 @@ class Layout:
 class Packed(NamedTuple):
     """Records that are ready to be added."""
 
-    layout: Layout
+    layout: RecordLayout
     sections: Sections
 
 
-def layout_of(step: Mapping[str, Any], deter_dtype: str, classes: int) -> Layout:
+def layout_of(step: Mapping[str, Any], deter_dtype: str, classes: int) -> RecordLayout:
     """The layout of the first record.
 
     Raises:
@@ -197,7 +197,7 @@ def layout_of(step: Mapping[str, Any], deter_dtype: str, classes: int) -> Layout
     dtypes = {
         key: np.dtype(TYPES.get(key, floats.get(key, value.dtype))).newbyteorder("=") for key, value in values.items()
     }
-    return Layout({key: (dtypes[key], value.shape) for key, value in values.items()}, deter_dtype, classes)
+    return RecordLayout({key: (dtypes[key], value.shape) for key, value in values.items()}, deter_dtype, classes)
 
 
 def index_type(classes: int) -> np.dtype[Any]:

@@ -3,8 +3,6 @@
 import os
 import threading
 
-BINARY = getattr(os, "O_BINARY", 0)  # of os.open: without it Windows replaces line ends
-
 _position = threading.Lock()
 
 

@@ -1,29 +1,25 @@
 """Saving the content of a buffer, and bringing it back: [REP-29] to [REP-32]."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamer_spec.files import open_file
+from dreamer_spec.disk.files import open_file
 from dreamer_spec.replay.chunks import Chunk, ChunkStore, Shape
+from dreamer_spec.replay.contents import Contents
 from dreamer_spec.replay.items import are_representable, decode, encode
 from dreamer_spec.replay.journal import entries, journal_epochs, journal_path, old_latents
-from dreamer_spec.replay.layout import Layout
+from dreamer_spec.replay.layout import RecordLayout
 from dreamer_spec.replay.saves import read_saved, saved_epochs, saved_path
 from dreamer_spec.replay.storage import Storage, Stream
-
-if TYPE_CHECKING:
-    from dreamer_spec.replay.buffer import Replay
 
 Arrays = Mapping[str, NDArray[Any]]
 
 
-def save(replay: Replay, name: str) -> dict[str, Any]:
+def save(replay: Contents, name: str) -> dict[str, Any]:
     """See Replay.save. First the chunks, then the file that refers to them: whenever it is interrupted, one state is
     complete."""
     storage = replay.storage
@@ -33,9 +29,9 @@ def save(replay: Replay, name: str) -> dict[str, Any]:
         for chunk in storage.dirty.values():
             storage.sum_latents(chunk)
             storage.store.flush(chunk.number)
-        if replay.history.journal is not None:
-            replay.history.journal.flush()
-    description = replay.history.begin_epoch(name, _arrays(replay), _facts(replay))
+        if replay.epochs.journal is not None:
+            replay.epochs.journal.flush()
+    description = replay.epochs.begin_epoch(name, _arrays(replay), _facts(replay))
     if storage is not None:
         for chunk in storage.dirty.values():
             chunk.saved, chunk.touched = chunk.count, None
@@ -43,7 +39,7 @@ def save(replay: Replay, name: str) -> dict[str, Any]:
     return description
 
 
-def _facts(replay: Replay) -> dict[str, Any]:
+def _facts(replay: Contents) -> dict[str, Any]:
     storage = replay.storage
     return {
         "length": replay.length,
@@ -54,7 +50,7 @@ def _facts(replay: Replay) -> dict[str, Any]:
     }
 
 
-def _arrays(replay: Replay) -> dict[str, NDArray[Any]]:
+def _arrays(replay: Contents) -> dict[str, NDArray[Any]]:
     chunks = [
         (chunk, stream.number, index) for stream in replay.streams.values() for index, chunk in stream.chunks.items()
     ]
@@ -73,7 +69,7 @@ def _arrays(replay: Replay) -> dict[str, NDArray[Any]]:
     }
 
 
-def restore(replay: Replay, description: Mapping[str, Any], continue_streams: bool) -> None:
+def restore(replay: Contents, description: Mapping[str, Any], continue_streams: bool) -> None:
     """See Replay.restore. It may be interrupted at any point and done again."""
     arrays, facts = read_saved(replay.directory, description)
     storage = _matching_storage(replay, arrays, facts)
@@ -88,7 +84,7 @@ def restore(replay: Replay, description: Mapping[str, Any], continue_streams: bo
         _leave_out_damaged(storage, chunks, replay.warnings)
         _rebuild(replay, storage, arrays, chunks, continue_streams)
     needed = {chunk.number for stream in replay.streams.values() for chunk in stream.chunks.values()}
-    replay.history.resume(facts["epoch"], set(arrays["chunks"][:, 0].tolist()), needed, replay.warnings)
+    replay.epochs.resume(facts["epoch"], set(arrays["chunks"][:, 0].tolist()), needed, replay.warnings)
 
 
 def require_readable(directory: Path, epoch: int) -> None:
@@ -102,7 +98,7 @@ def require_readable(directory: Path, epoch: int) -> None:
             open_file(journal_path(directory, number)).close()
 
 
-def _matching_storage(replay: Replay, arrays: Arrays, facts: Mapping[str, Any]) -> Storage | None:
+def _matching_storage(replay: Contents, arrays: Arrays, facts: Mapping[str, Any]) -> Storage | None:
     """The storage that a saved state needs, None if nothing had been added yet.
 
     Raises:
@@ -114,7 +110,7 @@ def _matching_storage(replay: Replay, arrays: Arrays, facts: Mapping[str, Any]) 
         )
     if facts["layout"] is None:
         return None
-    layout = Layout.from_json(facts["layout"])
+    layout = RecordLayout.from_json(facts["layout"])
     for name in ("deter_dtype", "classes"):
         if getattr(layout, name) != getattr(replay, name):
             raise ValueError(f"the saved replay has {name} {getattr(layout, name)}, this one {getattr(replay, name)}")
@@ -142,7 +138,7 @@ def _matching_storage(replay: Replay, arrays: Arrays, facts: Mapping[str, Any]) 
             f"the saved replay in {replay.directory} contradicts itself: its streams or chunks are impossible"
         )
     store = ChunkStore(replay.directory, Shape(layout, records), replay.memory_limit)
-    replay.storage = Storage(store, block, replay.history)
+    replay.storage = Storage(store, block, replay.epochs)
     return replay.storage
 
 
@@ -188,7 +184,7 @@ def _leave_out_damaged(storage: Storage, chunks: dict[int, Chunk], warnings: lis
 
 
 def _rebuild(
-    replay: Replay, storage: Storage, arrays: Arrays, chunks: Mapping[int, Chunk], continue_streams: bool
+    replay: Contents, storage: Storage, arrays: Arrays, chunks: Mapping[int, Chunk], continue_streams: bool
 ) -> None:
     """Streams, items and queue. What is left of a stream on either side of a hole becomes a stream of its own."""
     places: dict[int, dict[int, Chunk]] = {}
@@ -260,7 +256,7 @@ def _renumbered(codes: NDArray[np.int64], table: list[tuple[int, int, int, int]]
     return encode(np.stack([number[part], items[:, 1]], axis=-1))[inside]
 
 
-def _held(storage: Storage, parts: Mapping[int, Stream], replay: Replay) -> dict[int, Stream]:
+def _held(storage: Storage, parts: Mapping[int, Stream], replay: Contents) -> dict[int, Stream]:
     """The streams that are held, from their oldest item on; a stream that is written to keeps what its next item
     needs."""
     items = replay.items.to_array()

@@ -9,7 +9,6 @@ any more is deleted when no kept save refers to it.
 
 import dataclasses
 import json
-import os
 import re
 import zlib
 from collections.abc import Iterable, Mapping
@@ -21,7 +20,8 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
-from dreamer_spec.files import Unreadable, entries, free_name, open_file, reading, replacing
+from conformance.schema import closed, misfit, validator
+from dreamer_spec.disk.files import Unreadable, entries, flush, free_name, open_file, reading, replacing
 from dreamer_spec.replay.chunks import chunk_numbers, chunk_path, disk_errors, next_number, numbers
 from dreamer_spec.replay.journal import Journal, journal_epochs, journal_path
 
@@ -36,6 +36,25 @@ _ARRAYS = {
     "workers": (2, 2),
 }
 _UNSIGNED = ("sums", "block_sums")
+_COUNTS = ("format", "epoch", "length", "next_stream", "block_records", "chunk_records")
+_COUNT, _TEXT = {"type": "integer", "minimum": 0}, {"type": "string"}
+_FACTS = validator(
+    {
+        "type": "object",
+        "properties": dict.fromkeys(_COUNTS, _COUNT) | {"name": _TEXT},
+        "required": [*_COUNTS, "name", "layout"],
+    }
+)
+_DESCRIPTION = validator(
+    closed(
+        {
+            "format": {"const": FORMAT},
+            "name": _TEXT,
+            "file": _TEXT | {"pattern": r"^saved-[0-9]{10}\.safetensors\Z"},
+            "crc32": _COUNT,
+        }
+    )
+)
 _UNFINISHED = re.compile(r"\.saved-[0-9]{10}\.safetensors-[0-9a-f]{8}\.tmp")
 
 
@@ -47,7 +66,7 @@ class Saved:
     chunks: frozenset[int]
 
 
-class History:
+class Epochs:
     """The epochs of a directory: an epoch begins with a save, epoch 0 with an empty buffer.
 
     kept: epoch -> save that can be restored. journal: of the epoch that is going on, None in epoch 0, when nothing
@@ -89,7 +108,7 @@ class History:
             with replacing(path) as file:
                 file.write(data)
                 journal = Journal(self.directory, epoch)  # Before the name: a state that can be restored has a journal.
-            flush_directory(self.directory)
+            flush(self.directory)
         if self.journal:
             self.journal.close()
         self.journal, self.epoch = journal, epoch
@@ -189,7 +208,7 @@ def read_kept(path: Path) -> Saved:
     ValueError: the file is damaged; the message names it.
     """
     arrays, facts = _parse(path, _read(path))
-    return Saved(str(facts["name"]), frozenset(arrays["chunks"][:, 0].tolist()))
+    return Saved(facts["name"], frozenset(arrays["chunks"][:, 0].tolist()))
 
 
 def read_saved(directory: Path, description: Any) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
@@ -200,14 +219,9 @@ def read_saved(directory: Path, description: Any) -> tuple[dict[str, NDArray[Any
       ValueError: the description is none, or the file is missing, damaged or of another format; the message names the
         file.
     """
-    try:
-        name, expected = str(description["file"]), int(description["crc32"])
-        known = description["format"] == FORMAT
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"not a description of a replay state: {error!r:.200}") from error
-    if not known or not re.fullmatch(r"saved-[0-9]{10}\.safetensors", name):
-        raise ValueError(f"not a description of a replay state of format {FORMAT}: {description!r:.200}")
-    path = directory / name
+    if problem := misfit(description, _DESCRIPTION):
+        raise ValueError(f"not a description of a replay state of format {FORMAT}: {problem}")
+    path, expected = directory / description["file"], description["crc32"]
     try:
         data = _read(path)
     except FileNotFoundError:
@@ -254,16 +268,7 @@ def _require_arrays(arrays: Mapping[str, NDArray[Any]], facts: Any) -> None:
             raise ValueError(f"{key} holds something else than numbers from 0")
     if {len(arrays["chunks"])} != {len(arrays["sums"]), len(arrays["block_sums"])}:
         raise ValueError("there are not as many checksums as chunks")
-    for key in ("format", "epoch", "length", "next_stream", "block_records", "chunk_records"):
-        if not isinstance(facts[key], int) or facts[key] < 0:
-            raise ValueError(f"{key} is {facts[key]!r}")
+    if problem := misfit(facts, _FACTS):
+        raise ValueError(problem)
     if facts["format"] != FORMAT:
         raise ValueError(f"format {facts['format']}; this version reads {FORMAT}")
-
-
-def flush_directory(directory: Path) -> None:
-    fd = os.open(directory, os.O_RDONLY)
-    try:
-        os.fsync(fd)
-    finally:
-        os.close(fd)

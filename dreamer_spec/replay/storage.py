@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamer_spec.replay.chunks import Chunk, ChunkStore
-from dreamer_spec.replay.layout import Layout, Sections
-from dreamer_spec.replay.saves import History
+from dreamer_spec.replay.layout import RecordLayout, Sections
+from dreamer_spec.replay.saves import Epochs
 
 
 @dataclasses.dataclass
@@ -57,13 +57,13 @@ class Storage:
     block: records that are written at once and whose latents share a checksum; chunk_records is a multiple of it.
     """
 
-    def __init__(self, store: ChunkStore, block: int, history: History) -> None:
-        self.store, self.block, self.history = store, block, history
+    def __init__(self, store: ChunkStore, block: int, epochs: Epochs) -> None:
+        self.store, self.block, self.epochs = store, block, epochs
         self.records = store.shape.records
         self.dirty: dict[int, Chunk] = {}  # written to since the last save, by number of the file
 
     @property
-    def layout(self) -> Layout:
+    def layout(self) -> RecordLayout:
         return self.store.layout
 
     def append(self, stream: Stream, packed: Sections, row: int) -> None:
@@ -111,13 +111,13 @@ class Storage:
             if chunk is not None:
                 self.dirty.pop(chunk.number, None)
                 self.store.close(chunk.number)
-                if self.history.retire(chunk.number):
+                if self.epochs.retire(chunk.number):
                     self.store.discard(chunk.number)
 
     def _begin_block(self, stream: Stream, position: int) -> None:
         self.write_stage(stream)
         if position % self.records == 0:
-            number = self.history.new_chunk()
+            number = self.epochs.new_chunk()
             self.store.create(number)
             chunk = Chunk(
                 number=number,
@@ -199,11 +199,11 @@ class Storage:
         if chunk.touched is None:
             chunk.touched = np.zeros(self.records, np.bool_)
         fresh = np.flatnonzero(~chunk.touched[rows][: max(0, chunk.saved - span.chunk_row)])
-        if len(fresh) and self.history.journal is not None:
+        if len(fresh) and self.epochs.journal is not None:
             # Rows between that were written down before do no harm: the first entry of a row is the last to be undone.
             low, high = int(fresh[0]), int(fresh[-1]) + 1
             sections, row = self.sections(span)
-            self.history.journal.append(chunk.number, span.chunk_row + low, sections[-1][row + low : row + high])
+            self.epochs.journal.append(chunk.number, span.chunk_row + low, sections[-1][row + low : row + high])
         chunk.touched[rows] = True
 
     def sum_latents(self, chunk: Chunk) -> None:

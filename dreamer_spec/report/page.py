@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from conformance import pages
-from dreamer_spec.files import Unreadable, open_file, reading
+from dreamer_spec.disk.files import Unreadable, open_file, reading
 from dreamer_spec.report.charts import Task, task_charts
 from dreamer_spec.report.results import headline, result_row
 from dreamer_spec.report.runs import RunLog, differing, group_runs, settings, show

@@ -6,7 +6,7 @@ import time
 
 import numpy as np
 
-from dreamer_spec.logger import duration
+from dreamer_spec.monitoring.logger import duration
 from dreamer_spec.report.runs import Group, RunLog, show
 
 LAST_EPISODES = 20

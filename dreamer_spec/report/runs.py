@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from dreamer_spec.about import read_about
+from dreamer_spec.disk.about import read_about
+from dreamer_spec.disk.files import Unreadable, entries, read_json
 from dreamer_spec.errors import UserError
-from dreamer_spec.files import SUMS, Unreadable, entries, read_json
-from dreamer_spec.logger import iterate_metrics
+from dreamer_spec.monitoring.logger import iterate_metrics
 
 # Of the options, beside task, backend and hyperparameters, those that change what is learned: runs of one group agree
 # in all of them.
@@ -135,8 +135,7 @@ def find_logdirs(paths: Sequence[Path], say: Callable[[str], None] = print) -> l
 
 
 def _is_logdir(path: Path) -> bool:
-    """A checkpoint has a run.json too, and checksums."""
-    return (path / "metrics.jsonl").is_file() or ((path / "run.json").is_file() and not (path / SUMS).exists())
+    return (path / "metrics.jsonl").is_file() or (path / "run.json").is_file()
 
 
 def read_run(logdir: Path) -> RunLog:
@@ -198,7 +197,7 @@ def _from_checkpoint(logdir: Path) -> dict[str, Any]:
     """What the newest checkpoint says about a run that has no run.json."""
     for path in reversed(_checkpoints(logdir)):
         try:
-            info = read_json(path / "run.json")
+            info = read_json(path / "checkpoint.json")
             identity = dict(info["identity"])
             options = {name: identity.pop(name) for name in ("task", "seed", *LEARNING_OPTIONS) if name in identity}
             about = {"task": options.pop("task", ""), "backend": info.get("backend"), "spaces": info.get("spaces")}
