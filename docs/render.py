@@ -15,7 +15,6 @@ A part stands between a marker line and an end line, and is never edited by hand
 import ast
 import functools
 import json
-import math
 import re
 import sys
 from collections.abc import Callable
@@ -23,9 +22,8 @@ from pathlib import Path
 from typing import Any
 
 from conformance.commands.mutants import is_named
-from conformance.reports import summary
 from conformance.requirements import chapter_of, requirements
-from docs import examples, strangers
+from docs import backends, examples, strangers
 from dreamer_spec.report import catalogue
 from spec import Edition, benchmarks, editions, hyperparameters, profiles, sizes
 
@@ -128,61 +126,16 @@ def benchmark_table() -> str:
     return markdown_table(["suite", *names], rows)
 
 
-def conformance_runs() -> dict[tuple[str, str, str], dict[str, Any]]:
-    """The committed runs of the kit: (candidate, dtype, edition) -> report of `conformance check --json`."""
-    reports = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(RESULTS.glob("conformance-*.json"))]
-    order = ("jax", "torch", "float64", "float32", "bfloat16", "paper", "2024-12")
-    keyed = {(report["candidate"], report["dtype"], report["edition"]): report for report in reports}
-    return dict(sorted(keyed.items(), key=lambda item: tuple(map(order.index, item[0]))))
-
-
 def conformance_summary() -> str:
-    """One line for each run: how many checks, and how near the worst number came to what is allowed."""
-    rows = []
-    for key, report in conformance_runs().items():
-        statuses = [entry["status"] for entry in report["checks"].values()]
-        counts = [str(statuses.count(status)) for status in ("pass", "fail", "error", "not offered")]
-        numbers = sum(entry["compared"] for entry in report["checks"].values())
-        name, worst = max(
-            report["requirements"].items(), key=lambda item: math.inf if item[1]["share"] is None else item[1]["share"]
-        )
-        share = "no number" if worst["share"] is None else f"{worst['share']:.0%}"
-        rows.append([*key, *counts, f"{numbers:,}", f"{share} ({name})"])
-    return markdown_table(
-        [
-            "backend",
-            "dtype",
-            "edition",
-            "pass",
-            "fail",
-            "error",
-            "not offered",
-            "numbers compared",
-            "worst, of allowed",
-        ],
-        rows,
-    )
+    """The committed runs of the kit on our backends."""
+    header = ["backend", "dtype", "edition", *backends.STATUSES, "numbers compared", "worst, of allowed"]
+    return markdown_table(header, backends.summary_rows())
 
 
 def conformance_chapters() -> str:
-    """For each chapter the requirements of which all checks that are offered pass in float64, and the worst share of
-    what is allowed."""
-    runs = {key: report for key, report in conformance_runs().items() if key[1] == "float64"}
-    prefixes = list(dict.fromkeys(name.split("-")[0] for report in runs.values() for name in report["requirements"]))
-
-    def cell(report: dict[str, Any], prefix: str) -> str:
-        statuses = {
-            name: summary.status(report, name) for name in report["requirements"] if name.split("-")[0] == prefix
-        }
-        offered = [name for name, status in statuses.items() if status != "not offered"]
-        if not offered:
-            return "not offered"
-        passed = sum(statuses[name] in ("pass", "partly offered") for name in offered)
-        shares = (report["requirements"][name]["share"] for name in offered)
-        return f"{passed} of {len(offered)}, {max(math.inf if share is None else share for share in shares):.0%}"
-
-    rows = [[prefix, *(cell(report, prefix) for report in runs.values())] for prefix in prefixes]
-    return markdown_table(["requirements", *(f"{backend}, {edition}" for backend, _, edition in runs)], rows)
+    """The same, chapter by chapter, in float64."""
+    columns, rows = backends.chapter_rows()
+    return markdown_table(["requirements", *columns], rows)
 
 
 def mutants() -> dict[str, dict[str, dict[str, Any]]]:
