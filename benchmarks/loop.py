@@ -1,9 +1,9 @@
 """Measures the loop of `train`: `python -m benchmarks.loop --out docs/results/loop.json`.
 
 Share: for how much of the wall time the learner computes train steps, with an environment that takes no time and with
-one that sleeps 20 ms
-a step in a process of its own. Memory: a run that writes many times more to the replay buffer than it may map. Each run
-is a process of its own; the numbers are those of its metrics.jsonl, the first lines (compilation) left out.
+one that sleeps 20 ms a step in a process of its own. Memory: a run that writes many times more to the replay buffer
+than it may map. Each run is a process of its own; the numbers are those of its metrics.jsonl, the first lines
+(compilation) left out.
 """
 
 import argparse

@@ -48,8 +48,8 @@ class Diagnosis:
     """The candidate behaves like a mutant.
 
     explained: names of the failing checks in which its results are those of the mutant. unexplained: of the other
-    failing checks that
-    can be compared. alternatives: mutants that explain the same checks and cannot be told apart by any other.
+    failing checks that can be compared. alternatives: mutants that explain the same checks and cannot be told apart by
+    any other.
     """
 
     mutant: Mutant

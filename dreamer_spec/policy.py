@@ -31,8 +31,7 @@ class Policy:
     """Acts in `n` environments at once, with a carry of its own for each.
 
     spaces: what it sees and does. translation: what the environment's values become. config: its hyperparameters. info:
-    what else
-    policy.json says: task, step, backend, action_repeat, image_size, environment, source, versions.
+    what else policy.json says: task, step, backend, action_repeat, image_size, environment, source, versions.
     """
 
     def __init__(self, saved: SavedAgent) -> None:

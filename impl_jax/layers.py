@@ -174,8 +174,8 @@ def activate(x: jax.Array, scale: jax.Array, epsilon: float) -> jax.Array:
 def _activate_bwd(epsilon: float, saved: tuple[jax.Array, jax.Array], g: jax.Array) -> tuple[jax.Array, jax.Array]:
     """The gradients by x and scale of y = silu(v) with v = u scale, u = ρ x, given g = dL/dy.
 
-    With ρ = 1 / sqrt(mean(x²) + epsilon) over n entries, du_j/dx_k = ρ (δ_jk - u_j u_k / n). So, with
-    s = g silu'(v) and a = s scale: dL/dx = ρ (a - u mean(a u)), dL/dscale = sum over rows of s u.
+    With ρ = 1 / sqrt(mean(x²) + epsilon) over n entries, du_j/dx_k = ρ (δ_jk - u_j u_k / n). So, with s = g silu'(v)
+    and a = s scale: dL/dx = ρ (a - u mean(a u)), dL/dscale = sum over rows of s u.
     """
     x, scale = saved
 

@@ -139,8 +139,8 @@ def _gru_forward(gates: Tensor, deter: Tensor, out: Tensor | None = None) -> Ten
 def _gate_slopes(gates: Tensor, deter: Tensor) -> tuple[Tensor, Tensor]:
     """Derivatives of the new memory by the old one [..., n] and by the three gates [..., 3, n].
 
-    With R = σ(r), w = σ(k-1), v = tanh(R c) the new memory is h' = (1 - w) h + w v, so that
-    dh'/dh = 1 - w, dh'/dc = w (1 - v²) R, dh'/dr = w (1 - v²) c R (1 - R), dh'/dk = (v - h) w (1 - w).
+    With R = σ(r), w = σ(k-1), v = tanh(R c) the new memory is h' = (1 - w) h + w v, so that dh'/dh = 1 - w, dh'/dc = w
+    (1 - v²) R, dh'/dr = w (1 - v²) c R (1 - R), dh'/dk = (v - h) w (1 - w).
     """
     reset, candidate, update = widen(gates).unbind(-2)
     reset, update = torch.sigmoid(reset), torch.sigmoid(update - 1)  # R and w

@@ -2,14 +2,10 @@
 
 A file is a list of examples, each a call of one function with numbers that a reader can redo by hand:
 
-  ["a return by hand"]
-  requirements = ["RET-1"]
-  function = "lambda_return"           # of the interface, conformance/adapter.py
-  with.reward = [[9, 1, 0, 2]]         # its arguments, by name
-  with.discount = "1 - 1/333"          # a formula, where digits would say less
-  gives = [[2.28125, 1.125, 7]]
-  precision = "exact"
-  text = "The return of state 0 is {gives[0][0]}."
+  ["a return by hand"] requirements = ["RET-1"] function = "lambda_return"           # of the interface,
+  conformance/adapter.py with.reward = [[9, 1, 0, 2]]         # its arguments, by name with.discount = "1 - 1/333"
+  # a formula, where digits would say less gives = [[2.28125, 1.125, 7]] precision = "exact" text = "The return of state
+  0 is {gives[0][0]}."
 
 `precision` says how near a result must be: "exact", in every bit; "printed", half a unit of the last digit that is
 written (whole numbers and formulas: 1e-12 of the number); a number, relative; or a table of these, for the parts of a

@@ -177,8 +177,7 @@ def _damaged(path: Path, error: Exception) -> Damaged:
 def require_same_identity(checkpoint: Checkpoint, given: Mapping[str, Any]) -> None:
     """Raises:
     UserError: the checkpoint is of another configuration; the message lists name, value in the checkpoint, value given.
-    What may change
-    when a run is continued is not compared: [LOOP-70].
+    What may change when a run is continued is not compared: [LOOP-70].
     """
     saved = checkpoint.info["identity"]
     _require_same(

@@ -77,8 +77,7 @@ class Incident:
     """An incident as it was saved.
 
     info: what `save_incident` was given, and format, seed, device, versions. metrics: of the train step; repeated: of
-    the same step once
-    more, up to the gradients. tallies: of all tensors that are not finite.
+    the same step once more, up to the gradients. tallies: of all tensors that are not finite.
     """
 
     path: Path

@@ -29,12 +29,10 @@ WINDOW = 100_000  # records of all workers among which failures are counted
 class Environments:
     """`count` environments, in this process or in one process each.
 
-    make: index -> environment; must be picklable by cloudpickle.
-    timeout: seconds that a step, or a reset with the making before it, may take. Only a process of its own can be held
-    to it: an environment in this process that hangs stops everything, and nobody notices.
-    failures_allowed: within 100,000 records of all workers together. trial: what is known of these environments, if
-    they have been tried
-    out. task: for messages, where they have not.
+    make: index -> environment; must be picklable by cloudpickle. timeout: seconds that a step, or a reset with the
+    making before it, may take. Only a process of its own can be held to it: an environment in this process that hangs
+    stops everything, and nobody notices. failures_allowed: within 100,000 records of all workers together. trial: what
+    is known of these environments, if they have been tried out. task: for messages, where they have not.
 
     `start(action)` sends the actions off, `finish()` waits for the records: what happens in between overlaps with the
     environments where they have processes of their own. `reset(seeds)` begins everywhere anew, and seeds this episode

@@ -68,9 +68,8 @@ def prediction_errors(
 
     Means over sequences, steps and entries: for images of the squared error of the brightness in [0, 1]; for vectors
     and the reward of the squared error in symlog space; for a Discrete of the probability that the true class did not
-    get. A prediction counts up to the end of
-    the episode: how the next one begins, nobody could foresee. Where every episode ends with the context, `_error` is
-    missing.
+    get. A prediction counts up to the end of the episode: how the next one begins, nobody could foresee. Where every
+    episode ends with the context, `_error` is missing.
     """
     errors = {key: _errors(space, truth[key], predicted[key]) for key, space in spaces.observations.items()}
     errors["reward"] = _squared_symlog_error(truth["reward"], predicted["reward"])

@@ -61,8 +61,7 @@ class Prefetcher:
         be computed.
 
         computed: called in the thread when they are there. skipped: the metric of that train step, which may still be
-        computed too. Where
-        it is 1 the buffer stays as it is: [LOOP-43].
+        computed too. Where it is 1 the buffer stays as it is: [LOOP-43].
 
         Raises:
           whatever the write-back before has raised.

@@ -39,9 +39,8 @@ class RunLog:
     """One run.
 
     curves: by name of the metric. step, seconds: how far it is. written: when metrics.jsonl was written last, in
-    seconds since 1970, None
-    if it is not there. pictures: the newest PNG and GIF of every key that was predicted. notes: what was wrong with the
-    files.
+    seconds since 1970, None if it is not there. pictures: the newest PNG and GIF of every key that was predicted.
+    notes: what was wrong with the files.
     """
 
     logdir: Path
