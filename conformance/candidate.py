@@ -13,8 +13,14 @@ from typing import Any
 from conformance.adapter import COLUMNS, INTERFACE, OBJECTS, load_adapter
 from conformance.errors import UserError
 from conformance.foreign import ForeignAdapter, as_edition
+from conformance.own_names import ours, ours_in
 from conformance.process import ProcessAdapter
 from conformance.serve import convert_arrays, load_file, missing_field, to_numpy
+
+WAY_OUT = (
+    "rename yours, or run the adapter in a process where ours is not: "
+    'conformance check --process "python serve.py ADAPTER.py" (docs/adapters.md, Process)'
+)
 
 
 class ModuleAdapter(ForeignAdapter):
@@ -90,12 +96,21 @@ def load_candidate(name: str, dtype: str, device: str | None = None) -> object:
             raise UserError(f"{error}; install it with: pip install 'dreamer-spec[{name}]'") from error
         except (ValueError, RuntimeError) as error:
             raise UserError(str(error).partition("\n")[0]) from error
+    if taken := ours(name):
+        raise UserError(f"{name} cannot be an adapter: {taken} is the name of a package of dreamer-spec; {WAY_OUT}")
     try:
         return ModuleAdapter(_load_module(name), dtype)
     except SystemExit as error:
         raise UserError(
             f'{name} calls sys.exit({error.code!r}) when it is loaded; guard it with: if __name__ == "__main__"'
         ) from error
+    except (ImportError, AttributeError) as error:
+        if taken := ours_in(error):
+            raise UserError(
+                f"{name}: {error}: {taken} is a package of dreamer-spec, which hides any other module of that name; "
+                f"{WAY_OUT}"
+            ) from error
+        raise
 
 
 def _load_module(name: str) -> ModuleType:

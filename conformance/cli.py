@@ -10,12 +10,18 @@ from rich.console import Console
 from conformance.commands import COMMANDS
 from conformance.errors import UserError, say_error
 from conformance.output import never_fail
+from conformance.own_names import require_ours
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Returns 0 when everything that was asked holds, 1 when it does not, 2 for a wrong command line, 130 after
     Ctrl-C."""
     never_fail()
+    try:
+        require_ours()
+    except ImportError as error:
+        print(f"conformance: error: {error}", file=sys.stderr)
+        return 2
     parser = argparse.ArgumentParser(
         prog="conformance", description="Checks an implementation of DreamerV3 against the specification."
     )

@@ -10,12 +10,14 @@ class UserError(Exception):
     and exits with code 2.
 
     details: what helps to understand it and needs its own lines, such as the traceback of an environment; printed
-    before the message.
+    before the message, and a note of the exception where nobody catches it.
     """
 
     def __init__(self, message: str, details: str = "") -> None:
         super().__init__(message)
         self.details = details
+        if details:
+            self.add_note(details)
 
 
 def say_error(command: str, error: UserError, where: str = "") -> None:

@@ -44,11 +44,25 @@ def write(arguments: Mapping[str, Any]) -> list[str]:
     return [f"{name}={value if _is_plain(value) else json.dumps(value)}" for name, value in arguments.items()]
 
 
+def checked(arguments: Any) -> dict[str, Any]:
+    """Keyword arguments that were given as values of Python.
+
+    Raises:
+      TypeError, ValueError, OverflowError: they are none, or files would hold others.
+    """
+    check(arguments)
+    text = json.dumps(arguments, ensure_ascii=False)
+    text.encode("utf-8")  # Half a surrogate pair could not be saved.
+    if _parse(text) != arguments:
+        raise ValueError("JSON has no such values")
+    return dict(arguments)
+
+
 def check(arguments: Any) -> None:
     """Raises:
     ValueError: not keyword arguments.
     """
-    if not isinstance(arguments, dict) or not all(name.isidentifier() for name in arguments):
+    if not isinstance(arguments, dict) or not all(isinstance(name, str) and name.isidentifier() for name in arguments):
         raise ValueError(f"expected keyword arguments of an environment, got {arguments!r:.80}")
 
 

@@ -1,6 +1,14 @@
 """The command `train`: options in, a run out, and one line for every mistake that the user can mend."""
 
+import sys
+
 from dreamer_spec.system import before_numpy  # noqa: F401
+
+try:
+    from dreamer_spec import own_packages  # noqa: F401
+except ImportError as stranger:
+    print(f"train: error: {stranger}", file=sys.stderr)
+    sys.exit(2)
 
 # isort: split
 import argparse
@@ -9,10 +17,8 @@ import importlib.util
 import os
 import re
 import shlex
-import sys
 import threading
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import Any, NoReturn
 
 from conformance.errors import say_error
@@ -20,26 +26,12 @@ from conformance.output import never_fail
 from dreamer_spec import arguments as keywords
 from dreamer_spec.commands import COMMANDS
 from dreamer_spec.errors import UserError, is_out_of_memory
-from dreamer_spec.options import (
-    DEFAULT_PRESET,
-    EVAL_ENV,
-    NONFINITE,
-    PROCESSES,
-    RESUME,
-    TRAIN_WHEN,
-    Options,
-    did_you_mean,
-    make_options,
-    of_seeds,
-    presets,
-)
-from dreamer_spec.replay.layout import DETER_DTYPES
+from dreamer_spec.option_table import options_by_group
+from dreamer_spec.options import BACKENDS, Options, assemble_options, did_you_mean, of_seeds
 from dreamer_spec.system.machine import own_version
 from dreamer_spec.system.signals import stoppable
-from spec import built_profiles, hyperparameters, profiles, sizes
+from spec import hyperparameters
 
-BACKENDS = ("jax", "torch")
-LONGEST, LARGEST = 1e9, 1e9  # seconds, GiB: more than anybody means, and less than the system refuses
 USAGE = "train --backend {jax,torch} [options]\n       train COMMAND ... (train COMMAND --help says more)"
 DESCRIPTION = """Train a DreamerV3 agent.
 
@@ -51,15 +43,6 @@ DESCRIPTION = """Train a DreamerV3 agent.
 The same command again continues the run in its log directory. Commands for what it leaves there:
 
 """ + "\n".join(f"  train {name:8}{what}" for name, what in COMMANDS.items())
-
-GROUPS = {
-    "general": "hyperparameters: batches",
-    "model": "hyperparameters: networks",
-    "world_model": "hyperparameters: world model learning",
-    "behavior": "hyperparameters: actor and critic learning",
-    "optimizer": "hyperparameters: optimizer",
-    "loop": "hyperparameters: replay and environments",
-}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -159,7 +142,7 @@ def options_of(values: Mapping[str, Any]) -> Options:
         given["env_arg"] = keywords.join(given["env_arg"])
     backend, preset = given.pop("backend"), given.pop("preset", None)
     overrides = {name: given.pop(name) for name in hyperparameters() if name in given}
-    return make_options(backend, given, overrides, preset)
+    return assemble_options(backend, given, overrides, preset)
 
 
 class Parser(argparse.ArgumentParser):
@@ -197,209 +180,11 @@ def build_parser() -> argparse.ArgumentParser:
 def add_options(parser: argparse.ArgumentParser, begins: bool = True) -> None:
     """The options of a run. begins: those too with which `train` begins one, and which a run that `train resume`
     continues has already."""
-    base = presets()["base"]
-
-    run = parser.add_argument_group("run")
-    run.add_argument("--backend", choices=BACKENDS, help="which implementation trains")
-    if begins:
-        _add_beginning(run.add_argument)
-    run.add_argument(
-        "--task",
-        metavar="SUITE:NAME",
-        help="gym:ID, dmc:DOMAIN-TASK (vectors), dmc_vision:DOMAIN-TASK (images) or MODULE:CALLABLE",
-    )
-    run.add_argument(
-        "--size",
-        choices=list(sizes()),
-        metavar="SIZE",
-        help=f"model size: {', '.join(sizes())} (default {base['size']})",
-    )
-    run.add_argument(
-        "--profile",
-        choices=list(profiles()),
-        metavar="PROFILE",
-        help=f"{', '.join(built_profiles())} (default {base['profile']}); see docs/editions.md",
-    )
-    run.add_argument(
-        "--steps",
-        type=_whole(1),
-        metavar="N",
-        help=f"environment steps, with action repeat (default {base['steps']:,})",
-    )
-    run.add_argument("--seed", type=_whole(0), metavar="N", help="seed of everything random (default 0)")
-    run.add_argument("--device", metavar="NAME", help="cpu, gpu, cuda:1, ... (default: the backend's choice)")
-    run.add_argument(
-        "--threads",
-        type=_whole(1),
-        metavar="N",
-        help="that compute on the CPU (default: by backend, model size and cores; see docs/runs.md)",
-    )
-    run.add_argument(
-        "--nonfinite",
-        choices=NONFINITE,
-        help=(
-            "after a loss or gradient that is not finite: stop, and save what `train inspect` "
-            "shows (default), or skip the update"
-        ),
-    )
-    run.add_argument(
-        "--preflight",
-        action=argparse.BooleanOptionalAction,
-        help="--no-preflight: skip the check of the backend before training",
-    )
-
-    run.add_argument(
-        "--wandb", metavar="PROJECT", help="log to Weights & Biases too (pip install 'dreamer-spec[wandb]')"
-    )
-
-    envs = parser.add_argument_group("environments")
-    envs.add_argument(
-        "--env-arg",
-        type=keywords.read,
-        action="append",
-        metavar="NAME=VALUE",
-        help="keyword argument of a Gymnasium id or a CALLABLE, the value as JSON or else as text; one option for each",
-    )
-    envs.add_argument(
-        "--time-limit",
-        type=_whole(1),
-        metavar="N",
-        help="steps of the environment, before action repeat, that truncate an episode (default: the suite's limit)",
-    )
-    envs.add_argument("--action-repeat", type=_whole(1), metavar="N", help="apply each action N times (default 1)")
-    envs.add_argument(
-        "--image-size", type=_whole(1), metavar="N", help="side to which images are resized, in pixels (default 64)"
-    )
-    envs.add_argument(
-        "--observations",
-        type=_words,
-        metavar="KEY,...",
-        help="use only these keys; `*` stands for any letters (default: all)",
-    )
-    envs.add_argument("--leave-out", type=_words, metavar="KEY,...", help="do not use these keys of the observations")
-    envs.add_argument(
-        "--processes", choices=PROCESSES, help="one process per environment; auto: if its steps are slow (default)"
-    )
-
-    envs.add_argument(
-        "--env-timeout",
-        type=_seconds,
-        metavar="SECONDS",
-        help="a process that takes longer for a step is restarted (default 600)",
-    )
-    envs.add_argument(
-        "--env-failures",
-        type=_whole(0),
-        metavar="N",
-        help="failures of environments, per 100,000 steps, that end the run (default 10)",
-    )
-    envs.add_argument(
-        "--restore-envs",
-        action=argparse.BooleanOptionalAction,
-        help="--no-restore-envs: a resumed run begins new episodes; otherwise it "
-        "repeats the actions of those under way. "
-        "For environments that must not or cannot repeat them",
-    )
-
-    envs.add_argument(
-        "--info-metrics",
-        metavar="NAME,...",
-        help=(
-            "numbers in the info of an episode's last step to log: is_success, or a/b for "
-            "info['a']['b'], or a/* for all in it"
-        ),
-    )
-
-    replay = parser.add_argument_group("replay")
-    replay.add_argument(
-        "--replay-memory", type=_positive, metavar="GIB", help="memory that maps the files of the buffer (default 2)"
-    )
-    replay.add_argument(
-        "--replay-deter", choices=DETER_DTYPES, help="precision of the latents in the buffer (default bfloat16)"
-    )
-
-    schedule = parser.add_argument_group("schedule")
-    schedule.add_argument(
-        "--eval-every",
-        type=_whole(0),
-        metavar="N",
-        help=f"environment steps between evaluations; 0: at the end only (default {base['eval_every']:,})",
-    )
-    schedule.add_argument(
-        "--eval-env",
-        choices=EVAL_ENV,
-        help=(
-            "shared: evaluations are played in the single environment of training, when "
-            "its episode has ended (default own)"
-        ),
-    )
-    schedule.add_argument(
-        "--train-when",
-        choices=TRAIN_WHEN,
-        help=(
-            "between-episodes: train steps that become due wait until the episode of the single "
-            "environment has ended (default always)"
-        ),
-    )
-    schedule.add_argument(
-        "--eval-episodes", type=_whole(0), metavar="N", help="episodes of an evaluation; 0: none (default 10)"
-    )
-    schedule.add_argument(
-        "--random-episodes",
-        type=_whole(0),
-        metavar="N",
-        help="episodes that measure a random policy first (default 10)",
-    )
-    schedule.add_argument(
-        "--checkpoint-every", type=_seconds, metavar="SECONDS", help="time between checkpoints (default 300)"
-    )
-    schedule.add_argument(
-        "--keep-checkpoints", type=_whole(1), metavar="N", help="the newest ones that stay on the disk (default 2)"
-    )
-    schedule.add_argument(
-        "--log-every", type=_seconds, metavar="SECONDS", help="time between lines of metrics (default 5)"
-    )
-
-    groups = {name: parser.add_argument_group(title) for name, title in GROUPS.items()}
-    for name, entry in hyperparameters().items():
-        kind, metavar = _kind(entry)
-        groups[entry["group"]].add_argument(
-            f"--{name.replace('_', '-')}",
-            dest=name,
-            type=kind,
-            metavar=metavar,
-            choices=entry.get("choices"),
-            help=_help(name, entry),
-        )
-
-
-def _add_beginning(add: Callable[..., Any]) -> None:
-    """Which run: its preset, seeds, log directory and first parameters."""
-    add("--preset", metavar="NAME", help=_preset_help())
-    add(
-        "--seeds",
-        type=_seeds,
-        metavar="N-M,...",
-        help="several runs, one after the other: 0-4 or 0,2,5; with --logdir, in DIR/seedN",
-    )
-    add(
-        "--logdir",
-        type=_folder,
-        metavar="DIR",
-        help="metrics, checkpoint and picture (default runs/TASK-BACKEND-seedN)",
-    )
-    add(
-        "--from",
-        dest="from_",
-        type=Path,
-        metavar="RUN",
-        help="a new run begins with the parameters of this one, or of a checkpoint",
-    )
-    add(
-        "--resume",
-        choices=RESUME,
-        help="auto: continue the run in the log directory if there is one (default); never, must: or else an error",
-    )
+    for title, options in options_by_group().items():
+        group = parser.add_argument_group(title)
+        for option in options:
+            if begins or not option.begins:
+                group.add_argument(option.flag, **option.settings)
 
 
 def _with_dashes(argument: str) -> str:
@@ -408,116 +193,6 @@ def _with_dashes(argument: str) -> str:
         return argument
     name, separator, value = argument.partition("=")
     return name.replace("_", "-") + separator + value
-
-
-def _preset_help() -> str:
-    entries = "; ".join(f"{name}: {preset['help']}" for name, preset in presets().items() if name != "base")
-    return f"named settings, which other options override (default: {DEFAULT_PRESET} if no task is given). {entries}"
-
-
-def _help(name: str, entry: dict[str, Any]) -> str:
-    default = "by --size" if any(name in size for size in sizes().values()) else _show(entry["value"])
-    others = "".join(
-        f"; {profile}: {_show(profiles()[profile][name])}"
-        for profile in built_profiles()
-        if name in profiles()[profile]
-    )
-    symbol = f", {entry['symbol']}" if "symbol" in entry else ""
-    return f"{entry['help']}{symbol} (default {default}{others})".replace("%", "%%")
-
-
-def _show(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, list):
-        return ",".join(map(str, value))
-    return f"{value:g}" if isinstance(value, float) else str(value)
-
-
-def _kind(entry: dict[str, Any]) -> tuple[Callable[[str], Any], str]:
-    """How the value of a hyperparameter is read, and what `--help` calls it. Its range is checked by spec/config.py."""
-    value = entry["value"]
-    if "choices" in entry:
-        return str, "NAME"
-    if isinstance(value, bool):
-        return _boolean, "true|false"
-    if isinstance(value, list):
-        return _numbers, "N,N,..."
-    return (_whole(), "N") if isinstance(value, int) else (_real, "X")
-
-
-def _whole(least: int | None = None) -> Callable[[str], int]:
-    def convert(text: str) -> int:
-        try:
-            number = float(text)
-            value = int(number) if number.is_integer() and abs(number) < 2**53 else None
-        except (ValueError, OverflowError):
-            value = None
-        if value is None or (least is not None and value < least):
-            raise argparse.ArgumentTypeError(
-                f"{text!r} is not a whole number{'' if least is None else f' of at least {least}'}"
-            )
-        return value
-
-    return convert
-
-
-def _real(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None
-
-
-def _seconds(text: str) -> float:
-    value = _real(text)
-    if not 0 <= value <= LONGEST:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a time in seconds, from 0 to {LONGEST:g}")
-    return value
-
-
-def _positive(text: str) -> float:
-    value = _real(text)
-    if not 0 < value <= LARGEST:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0 and up to {LARGEST:g}")
-    return value
-
-
-def _boolean(text: str) -> bool:
-    if text.lower() not in ("true", "false"):
-        raise argparse.ArgumentTypeError(f"{text!r} is neither true nor false")
-    return text.lower() == "true"
-
-
-def _words(text: str) -> tuple[str, ...]:
-    words = tuple(word for word in text.split(",") if word)
-    if not words:
-        raise argparse.ArgumentTypeError(f"{text!r} names no key")
-    return words
-
-
-def _folder(text: str) -> Path:
-    if not text:
-        raise argparse.ArgumentTypeError("the name of the folder is empty")
-    return Path(text)
-
-
-def _numbers(text: str) -> list[int]:
-    return [_whole()(part) for part in text.split(",")]
-
-
-def _seeds(text: str) -> list[int]:
-    """0-2,5 -> [0, 1, 2, 5]"""
-    seeds: list[int] = []
-    for part in text.split(","):
-        ends = re.fullmatch(r"([0-9]{1,15})(?:-([0-9]{1,15}))?", part.strip())
-        first, last = (int(ends[1]), int(ends[2] or ends[1])) if ends else (0, -1)
-        if not first <= last < first + 1000:
-            raise argparse.ArgumentTypeError(f"{text!r} is no list of seeds such as 0-4 or 0,2,5, of at most 1,000")
-        seeds += range(first, last + 1)
-    if len(set(seeds)) < len(seeds):
-        raise argparse.ArgumentTypeError(f"{text!r} names a seed twice")
-    return seeds
 
 
 if __name__ == "__main__":

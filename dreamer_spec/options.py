@@ -5,7 +5,7 @@ import difflib
 import functools
 import re
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from typing import Any
 from dreamer_spec.errors import UserError
 from spec import Config, built_profiles, hyperparameters, load_config
 
+BACKENDS = ("jax", "torch")
 DEFAULT_PRESET = "cartpole"
 RESUME = ("auto", "never", "must")
 PROCESSES = ("auto", "yes", "no")
@@ -26,6 +27,8 @@ EVAL_ENV = ("own", "shared")
 class Options:
     """Everything that a run depends on, beside the code.
 
+    task: what names the environment. make: what makes it, where a script has given the callable itself; then the task
+    is its name.
     steps and eval_every are environment steps: records times action_repeat. checkpoint_every, log_every and env_timeout
     are seconds. replay_memory is in GiB. env_arg: keyword arguments of the environment. time_limit: in frames, that is
     before action repeat. observations, leave_out: keys or patterns of keys that the agent gets and does not get, all
@@ -37,6 +40,7 @@ class Options:
     config: Config
     logdir: Path
     steps: int
+    make: Callable[..., Any] | None = None
     from_: Path | None = None
     seed: int = 0
     device: str | None = None
@@ -97,7 +101,14 @@ def presets() -> dict[str, dict[str, Any]]:
     return tomllib.loads(resources.files("dreamer_spec").joinpath("presets.toml").read_text(encoding="utf-8"))
 
 
-def make_options(
+def defaults() -> dict[str, Any]:
+    """What a run has that names neither a preset nor the option: name of a field of Options, "profile" or "size" ->
+    value."""
+    fields = {field.name: field.default for field in dataclasses.fields(Options)}
+    return {**{name: value for name, value in fields.items() if value is not dataclasses.MISSING}, **presets()["base"]}
+
+
+def assemble_options(
     backend: str, given: Mapping[str, Any], changed: Mapping[str, Any], preset: str | None = None
 ) -> Options:
     """The options of a run: `given` by name of the fields of Options, plus "profile" and "size"; `changed`
@@ -133,7 +144,7 @@ def make_options(
     return Options(backend=backend, config=config, **settings)
 
 
-def default_logdir(task: str, backend: str, seed: int) -> Path:
+def default_logdir(task: str, backend: str, seed: int | str) -> Path:
     """runs/<task>-<backend>-seed<k>, the task without its suite and without characters that file systems dislike."""
     name = re.sub(r"[^A-Za-z0-9_.-]+", "-", task.removeprefix("gym:").replace(":", "-"))
     return Path("runs") / f"{name}-{backend}-seed{seed}"

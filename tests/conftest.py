@@ -11,7 +11,7 @@ from jax.experimental.compilation_cache import compilation_cache
 from train_fakes import FakeLearner
 from train_runs import SMALL, Make
 
-from dreamer_spec.options import Options, make_options
+from dreamer_spec.options import Options, assemble_options
 from spec import hyperparameters
 
 
@@ -40,7 +40,7 @@ def make(tmp_path: Path) -> Iterator[Make]:
             "log_every": 0.0,
         }
         plain["replay_deter"] = "float32"  # Latents say which call made them.
-        return make_options(
+        return assemble_options(
             "jax", {**plain, "eval_every": 0, "eval_episodes": 0, "random_episodes": 0, **given}, overrides
         )
 

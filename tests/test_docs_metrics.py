@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from dreamer_spec.monitoring.logger import iterate_metrics
-from dreamer_spec.options import make_options
+from dreamer_spec.options import assemble_options
 from dreamer_spec.report.catalogue import find, markdown, sections
 from dreamer_spec.training import loop
 
@@ -32,7 +32,7 @@ def emitted(backend: str, logdir: Path) -> set[str]:
         "random_episodes": 2,
     }
     settings = {**given, "size": "tiny", "preflight": False, "log_every": 0.0, "checkpoint_every": 0.0, "device": "cpu"}
-    assert loop.run(make_options(backend, settings, TINY))
+    assert loop.run(assemble_options(backend, settings, TINY))
     lines = [line for line in iterate_metrics(logdir / "metrics.jsonl") if line is not None]
     return {name for line in lines for name in line} - {"step", "seconds"}
 

@@ -18,7 +18,8 @@ import dreamer_spec.training.setup
 from dreamer_spec.cli import build_parser, main, parse
 from dreamer_spec.commands import COMMANDS
 from dreamer_spec.errors import UserError
-from dreamer_spec.options import make_options, presets
+from dreamer_spec.option_table import EVAL_OPTIONS, RUN_OPTIONS
+from dreamer_spec.options import Options, assemble_options, presets
 from spec import benchmarks, hyperparameters, load_config
 
 SMALL = {"deter": 8, "units": 4, "stoch": 2, "classes": 2, "batch-size": 2, "batch-length": 3, "envs": 2}
@@ -142,7 +143,7 @@ def test_failed_preflight(capsys: pytest.CaptureFixture[str], fakes: Report) -> 
         (["--learning-rate", "nan"], ["learning_rate", "nan"]),
         (["--compute-dtype", "int8"], ["--compute-dtype", "int8", "bfloat16"]),
         (["--cnn-outer", "maybe"], ["--cnn-outer", "maybe"]),
-        (["--cnn-multipliers", "1,x"], ["--cnn-multipliers", "'x'"]),
+        (["--cnn-multipliers", "1,x"], ["--cnn-multipliers", "'1,x'"]),
         (["--replay-capacity", "5"], ["replay_capacity is 5", "6"]),
         (["--no-such-thing", "5"], ["--no-such-thing"]),
         (["--steps", "0"], ["--steps", "at least 1"]),
@@ -240,6 +241,29 @@ def test_help_shows_meaning_symbol_and_default(capsys: pytest.CaptureFixture[str
     assert "DeepMind" in text
 
 
+def test_help_writes_no_default_itself(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Other values in presets.toml and in `Options` are other words in `--help`; the table has none."""
+    for options in (*RUN_OPTIONS.values(), EVAL_OPTIONS):
+        for option in options:
+            assert "default" not in option.meaning
+            assert option.default is None or option.name not in presets()["base"], option.name
+    monkeypatch.setitem(presets()["base"], "steps", 1234567)
+    monkeypatch.setitem(presets()["base"], "env_timeout", 7.5)
+    monkeypatch.setitem(hyperparameters()["free_nats"], "value", 1.25)
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    text = " ".join(capsys.readouterr().out.split())
+    assert "environment steps, with action repeat (default 1,234,567)" in text
+    assert "for a step is restarted (default 7.5)" in text
+    assert "(default 1.25)" in text
+    for field in dataclasses.fields(Options):
+        option = next(
+            (option for options in RUN_OPTIONS.values() for option in options if option.name == field.name), None
+        )
+        if option and isinstance(field.default, int | float | str) and not isinstance(field.default, bool):
+            assert re.search(r"\(default [^()]+\)$", option.help), field.name
+
+
 def test_whole_numbers_may_be_written_as_powers() -> None:
     assert parse(["--backend", "jax", "--steps", "1e5"]).steps == 100_000
     with pytest.raises(UserError, match=r"'1\.5'"):
@@ -268,7 +292,7 @@ def test_the_command_itself_says_one_line() -> None:
 
 @pytest.mark.parametrize("name", ["dmc_proprio", "dmc_vision"])
 def test_presets_of_the_papers_protocols_have_its_numbers(name: str) -> None:
-    protocol, options = benchmarks()[name], make_options("jax", {}, {}, name)
+    protocol, options = benchmarks()[name], assemble_options("jax", {}, {}, name)
     assert (options.steps, options.action_repeat) == (protocol["steps"], protocol["action_repeat"])
     assert (options.config.envs, options.config.replay_ratio) == (protocol["envs"], protocol["replay_ratio"])
     assert options.config == load_config(

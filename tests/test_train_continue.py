@@ -18,7 +18,7 @@ from dreamer_spec.cli import main
 from dreamer_spec.disk import checkpoint
 from dreamer_spec.disk.about import read_about, write_about
 from dreamer_spec.errors import UserError
-from dreamer_spec.options import Options, make_options, may_change
+from dreamer_spec.options import Options, assemble_options, may_change
 from dreamer_spec.training import loop
 from impl_torch.learner import Learner as TorchLearner
 from spec import Discrete, Spaces, Vector, hyperparameters, load_config
@@ -255,7 +255,7 @@ def tiny(tmp_path: Path, **given: Any) -> Options:
         "device": "cpu",
     }
     settings = {**plain, "eval_every": 0, "eval_episodes": 0, "random_episodes": 0, **given}
-    return make_options(
+    return assemble_options(
         "torch",
         settings,
         overrides | {name: settings.pop(name) for name in list(settings) if name in hyperparameters()},

@@ -11,7 +11,7 @@ from train_fakes import FakeLearner
 from train_runs import Make, run_quietly
 
 from dreamer_spec.envs import translate
-from dreamer_spec.options import make_options
+from dreamer_spec.options import assemble_options
 from dreamer_spec.training import forecast, loop
 from dreamer_spec.training.state import Counters
 
@@ -119,6 +119,6 @@ def test_a_run_forecasts(make: Make, monkeypatch: pytest.MonkeyPatch, capsys: py
 
 
 def test_the_preset_for_a_laptop_needs_a_task_and_takes_any() -> None:
-    options = make_options("torch", {"task": "my_module:make_env"}, {}, "laptop")
+    options = assemble_options("torch", {"task": "my_module:make_env"}, {}, "laptop")
     assert (options.task, options.steps) == ("my_module:make_env", 100_000)
     assert options.config.replay_capacity >= options.steps, "nothing is forgotten"

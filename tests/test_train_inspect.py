@@ -12,7 +12,7 @@ from dreamer_spec.cli import main
 from dreamer_spec.commands import inspect
 from dreamer_spec.disk import checkpoint
 from dreamer_spec.disk.incidents import save_incident
-from dreamer_spec.options import make_options
+from dreamer_spec.options import assemble_options
 from spec import Config, Discrete, Spaces, Vector
 
 SPACES = Spaces({"position": Vector(2)}, {"action": Discrete((2,))})
@@ -58,7 +58,7 @@ def incident(
     **identity: Any,
 ) -> Path:
     """An incident in which nothing is wrong but what is given."""
-    options = make_options("jax", {"task": "gym:CartPole-v1", "size": "tiny"}, identity)
+    options = assemble_options("jax", {"task": "gym:CartPole-v1", "size": "tiny"}, identity)
     measured = METRICS | (metrics or {})
     learner = Broken(
         STATE | (state or {}), GRADIENTS | (gradients or {}), measured if repeated is None else METRICS | repeated

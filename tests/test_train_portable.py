@@ -11,17 +11,16 @@ import train_fakes
 from train_agents import random_learner_state, save_checkpoint
 from train_runs import logged
 
-import dreamer_spec.commands.eval
+import dreamer_spec.separate_evaluation
 from conformance.adapters import jax_adapter, torch_adapter
 from conformance.problems import Problem, random_batch, small_config, train_noise, with_sampling_margin
 from dreamer_spec.backend import learner_class
 from dreamer_spec.cli import main
-from dreamer_spec.commands.eval import sentence, summarize
 from dreamer_spec.disk import checkpoint
 from dreamer_spec.disk.checkpoint import open_checkpoint
 from dreamer_spec.envs import Environments, make_env
 from dreamer_spec.replay import Replay
-from dreamer_spec.training.evaluation import Episode
+from dreamer_spec.separate_evaluation import Evaluation
 from reference_numpy import agent as reference
 from reference_numpy.training_loop import derive_seed
 from spec import Config, Discrete, Image, Spaces, Vector, parameter_table
@@ -83,9 +82,9 @@ def test_an_evaluation_says_returns_and_lengths(
 
 
 def test_one_episode_has_no_standard_error() -> None:
-    summary = summarize([Episode(7.5, 3, {})])
-    assert summary["return_standard_error"] is None
-    assert sentence(summary) == "return 7.5 (min 7.5, max 7.5), length 3 (min 3, max 3)"
+    played = Evaluation((7.5,), (3,), Path(), "a:b", 0, "jax", "jax", "cpu", 0, False, {}, None)
+    assert played.summary()["return_standard_error"] is None
+    assert str(played) == "return 7.5 (min 7.5, max 7.5), length 3 (min 3, max 3)"
 
 
 @pytest.mark.covers("LOOP-18")
@@ -138,7 +137,7 @@ def test_what_cannot_be_evaluated_is_named(counting: str, tmp_path: Path, capsys
     message = refusal(capsys, counting, "--episodes", "1", "--task", "gym:CartPole-v1")
     assert "Discrete(classes=(2,))" in message
     assert "Vector(size=2)" in message
-    assert "expected at least one episode" in refusal(capsys, counting, "--episodes", "0")
+    assert "--episodes: '0' is not a whole number of at least 1" in refusal(capsys, counting, "--episodes", "0")
     assert "see train eval --help" in refusal(capsys, counting, "--nonsense")
     assert "no checkpoint in" in refusal(capsys, str(tmp_path / "nowhere"), "--episodes", "1")
     assert "no device 'tpu9'" in refusal(capsys, counting, *COUNT, "1", "--device", "tpu9").replace("unknown", "no")
@@ -149,7 +148,9 @@ def test_what_cannot_be_evaluated_is_named(counting: str, tmp_path: Path, capsys
 def test_an_action_that_is_not_finite_ends_the_evaluation(
     counting: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(dreamer_spec.commands.eval.Agent, "__call__", lambda self, record: np.full((1, 2), np.nan))
+    monkeypatch.setattr(
+        dreamer_spec.separate_evaluation.Agent, "__call__", lambda self, record: np.full((1, 2), np.nan)
+    )
     assert "the action is not finite" in refusal(capsys, counting, *COUNT, "1")
 
 
@@ -305,5 +306,5 @@ def test_a_result_that_cannot_be_written_is_refused_before_an_episode(
     name: str,
     reason: str,
 ) -> None:
-    monkeypatch.setattr(dreamer_spec.commands.eval, "play", pytest.fail)
+    monkeypatch.setattr(dreamer_spec.separate_evaluation, "play", pytest.fail)
     assert reason in refusal(capsys, counting, *COUNT, "1", "--json", str(tmp_path / name))

@@ -98,7 +98,7 @@ def test_a_run_that_is_interrupted_among_train_steps_that_are_due_goes_on_with_t
     def learn_and_stop(run: Any) -> None:
         learn(run)
         if run.counters.train_steps == stop_at:
-            run.interrupted.append(2)
+            run.signals.append(2)
 
     monkeypatch.setattr(loop, "learn", learn_and_stop)
     options = single(train_when="between-episodes", logdir=tmp_path / "other")

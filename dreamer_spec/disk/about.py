@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from dreamer_spec import arguments as keywords
 from dreamer_spec.disk.files import free_name, read_json, replacing
 from dreamer_spec.errors import writing
-from dreamer_spec.options import Options, presets
+from dreamer_spec.options import Options, defaults
 from dreamer_spec.system.machine import describe
 from spec import Config, Spaces, built_profiles, load_config, sizes
 
@@ -116,13 +116,11 @@ def write_json(path: Path, value: About) -> About:
 def command_line(options: Options) -> list[str]:
     """The words of a command that gives these options, whatever the presets are."""
     profile, size, changed = nearest(options.config)
-    defaults = (
-        {field.name: field.default for field in dataclasses.fields(options)} | {"env_args": {}} | presets()["base"]
-    )
+    usual = defaults()
     words = ["train", "--backend", options.backend, "--task", options.task, "--profile", profile, "--size", size]
     for field in dataclasses.fields(options):
         value = getattr(options, field.name)
-        if field.name in ("backend", "task", "config", "env_arg") or value == defaults[field.name]:
+        if field.name in ("backend", "task", "make", "config", "env_arg") or value == usual.get(field.name):
             continue
         flag = field.name.rstrip("_").replace("_", "-")
         if isinstance(value, bool):
@@ -151,7 +149,9 @@ def nearest(config: Config) -> tuple[str, str, dict[str, Any]]:
 def options_json(options: Options) -> dict[str, Any]:
     """All but the hyperparameters, in plain JSON types."""
     values = {
-        field.name: getattr(options, field.name) for field in dataclasses.fields(options) if field.name != "config"
+        field.name: getattr(options, field.name)
+        for field in dataclasses.fields(options)
+        if field.name not in ("config", "make")
     }
     return {name: str(value) if isinstance(value, Path) else value for name, value in values.items()}
 

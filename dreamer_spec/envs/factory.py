@@ -4,6 +4,8 @@ gym:ID                   any registered Gymnasium id: gym:CartPole-v1, gym:ALE/P
 dmc:DOMAIN-TASK          DeepMind Control Suite from vectors: dmc:walker-walk
 dmc_vision:DOMAIN-TASK   the same from images only
 MODULE:CALLABLE          your own, a function or class that returns a gymnasium.Env: my_package.my_module:make_env
+
+A script may give the callable itself; its task is then its name.
 """
 
 import contextlib
@@ -17,12 +19,15 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
+from gymnasium.envs.registration import EnvSpec
 
+from conformance.own_names import ours, ours_in
 from dreamer_spec import arguments as keywords
 from dreamer_spec.envs.adapter import ContractEnv
 from dreamer_spec.envs.info import names_of
+from dreamer_spec.envs.sending import known_here, register, require_sendable
 from dreamer_spec.errors import UserError
-from dreamer_spec.options import Options
+from dreamer_spec.options import Options, names_code
 
 SUITES = "gym:ID, dmc:DOMAIN-TASK, dmc_vision:DOMAIN-TASK or MODULE:CALLABLE"
 
@@ -33,7 +38,27 @@ _EXTRAS = {"box2d": "box2d", "mujoco": "mujoco", "classic_control": "train"}
 
 
 def env_maker(options: Options, render: bool = False) -> Callable[[int], ContractEnv]:
-    """index -> the environment that these options describe."""
+    """index -> the environment that these options describe.
+
+    Raises:
+      UserError: a module that cannot be imported, because its name is ours; a callable that no process can be given.
+    """
+    module = options.task.removeprefix("gym:").partition(":")[0]
+    if names_code(options.task) and options.make is None and (taken := ours(module)):
+        raise UserError(
+            f"task {options.task}: {taken} is the name of a package of dreamer-spec, which hides any other module of "
+            f"that name; rename yours"
+        )
+    registered: list[EnvSpec] = []
+    if options.processes != "no":
+        try:
+            require_sendable(options.make)
+        except Exception as error:
+            raise UserError(
+                f"task {options.task} cannot be sent to a process of its own: {type(error).__name__}: {error}; let it "
+                f"make inside what it takes from outside, or keep environments in this process: --processes no"
+            ) from error
+        registered = known_here()
     return functools.partial(
         make_env,
         options.task,
@@ -45,6 +70,8 @@ def env_maker(options: Options, render: bool = False) -> Callable[[int], Contrac
         time_limit=options.time_limit,
         observations=options.observations,
         leave_out=options.leave_out,
+        make=options.make,
+        registered=registered,
     )
 
 
@@ -59,20 +86,27 @@ def make_env(
     time_limit: int | None = None,
     observations: Sequence[str] = (),
     leave_out: Sequence[str] = (),
+    make: Callable[..., Any] | None = None,
+    registered: Sequence[EnvSpec] = (),
 ) -> ContractEnv:
     """The environment of a task string, adapted. `index` numbers the instances of a run, for messages. render: with the
     render mode "rgb_array", where the environment has one. arguments: keyword arguments with which the environment is
-    made. time_limit: frames after which an episode is truncated, in place of the suite's limit: [LOOP-62]. The others:
-    see `ContractEnv`.
+    made. time_limit: frames after which an episode is truncated, in place of the suite's limit: [LOOP-62]. make: the
+    callable that makes the environment; the task is only its name then. registered: ids that Gymnasium shall know. The
+    others: see `ContractEnv`.
 
     Raises:
       UserError: an unknown task, a package that is not installed (with the pip command), arguments that the environment
       does not take, an unsupported space.
     """
+    register(registered)
+    arguments = arguments or {}
+    if make is not None:
+        env = _limited(_call(task, make, render, arguments), time_limit)
+        return ContractEnv(env, task, index, image_size, action_repeat, info_metrics, observations, leave_out)
     suite, separator, name = task.partition(":")
     if not separator or not suite or not name:
         raise UserError(f"unknown task {task!r}; expected {SUITES}")
-    arguments = arguments or {}
     if suite == "gym":
         env = _make_gymnasium(task, name, render, arguments, time_limit)
     elif suite in ("dmc", "dmc_vision"):
@@ -80,7 +114,7 @@ def make_env(
             raise UserError(f"task {task} takes no keyword arguments, and --env-arg {next(iter(arguments))} was given")
         env = _limited(_make_dm_control(task, name, suite == "dmc_vision", image_size, render, time_limit), time_limit)
     else:
-        env = _limited(_make_own(task, suite, name, render, arguments), time_limit)
+        env = _limited(_call(task, _find_own(task, suite, name), render, arguments), time_limit)
     return ContractEnv(env, task, index, image_size, action_repeat, info_metrics, observations, leave_out)
 
 
@@ -142,6 +176,20 @@ def _naming(task: str, arguments: Mapping[str, Any]) -> Iterator[None]:
         raise Refusal(line, traceback.format_exc()) from error
 
 
+@contextlib.contextmanager
+def _not_ours(task: str) -> Iterator[None]:
+    """What somebody's code raises that means a module of theirs, and gets our package of that name, becomes a line."""
+    try:
+        yield
+    except (ImportError, AttributeError) as error:
+        if taken := ours_in(error):
+            raise UserError(
+                f"task {task}: {error}: {taken} is a package of dreamer-spec, which hides any other module of that "
+                f"name; rename yours"
+            ) from error
+        raise
+
+
 def _given(arguments: Mapping[str, Any]) -> str:
     return "".join(f" --env-arg {argument}" for argument in keywords.write(arguments))
 
@@ -167,18 +215,22 @@ def _make_dm_control(
     return env
 
 
-def _make_own(
-    task: str, module_name: str, name: str, render: bool, arguments: Mapping[str, Any]
-) -> gymnasium.Env[Any, Any]:
-    module = _import_own(task, module_name)
-    function = getattr(module, name, None)
+def _find_own(task: str, module_name: str, name: str) -> Callable[..., Any]:
+    function = getattr(_import_own(task, module_name), name, None)
     if not callable(function):
         raise UserError(f"unknown task {task!r}: the module {module_name!r} has no function or class {name!r}")
+    return function
+
+
+def _call(
+    task: str, function: Callable[..., Any], render: bool, arguments: Mapping[str, Any]
+) -> gymnasium.Env[Any, Any]:
     if render and "render_mode" in inspect.signature(function).parameters:
         arguments = {**arguments, "render_mode": "rgb_array"}
-    with _naming(task, arguments):
+    with _naming(task, arguments), _not_ours(task):
         env = function(**arguments)
     if not isinstance(env, gymnasium.Env):
+        name = task.partition(":")[2]
         raise UserError(f"task {task}: {name}() returned a {type(env).__name__}; expected a gymnasium.Env")
     return env
 
@@ -197,7 +249,8 @@ def _import_own(task: str, module_name: str) -> Any:
         if here not in sys.path and "" not in sys.path:
             sys.path.insert(0, here)
     try:
-        return importlib.import_module(module_name)
+        with _not_ours(task):
+            return importlib.import_module(module_name)
     except ModuleNotFoundError as error:
         if error.name is None or not f"{module_name}.".startswith(f"{error.name}."):
             raise  # The module is there; something that it imports is not.

@@ -1,17 +1,20 @@
 """What the processes of environments have in common: how they are started, how they begin, and that they end with their
 trainer."""
 
+import contextlib
 import errno
 import multiprocessing
 import os
 import signal
 import sys
 import threading
+from collections.abc import Iterator
 from multiprocessing import connection
+from types import ModuleType
 
 from conformance.output import never_fail
 from dreamer_spec.envs.failure import describe
-from dreamer_spec.system.signals import NUMBERS
+from dreamer_spec.system.signals import NUMBERS, unbroken
 
 CLOSING = 5.0  # seconds that environments have to close by themselves
 DYING = 5.0  # seconds that a process has to be gone after it was killed
@@ -33,6 +36,20 @@ def start_method() -> str:
         ["dreamer_spec.system.worker_threads", "dreamer_spec.envs"]
     )  # In this order.
     return "forkserver"
+
+
+@contextlib.contextmanager
+def starting() -> Iterator[None]:
+    """Inside processes are started: no signal leaves one half made, and none imports the main module, which a script
+    would be run by again that has no `if __name__ == "__main__"`. They need nothing of it: what a script defines comes
+    to them by value.
+    """
+    with unbroken():
+        main, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
+        try:
+            yield
+        finally:
+            sys.modules["__main__"] = main
 
 
 def not_started(error: BaseException) -> str:

@@ -15,9 +15,17 @@ from gymnasium.vector.utils import CloudpickleWrapper
 from dreamer_spec.envs.adapter import ContractEnv
 from dreamer_spec.envs.failure import Failure, attempt
 from dreamer_spec.envs.guest import guest
-from dreamer_spec.envs.process import CLOSING, DYING, begin_worker, ended, no_answer, not_started, start_method
+from dreamer_spec.envs.process import (
+    CLOSING,
+    DYING,
+    begin_worker,
+    ended,
+    no_answer,
+    not_started,
+    start_method,
+    starting,
+)
 from dreamer_spec.envs.spaces import random_actions
-from dreamer_spec.system.signals import unbroken
 from dreamer_spec.translation import Translation
 
 SLOW_STEP = 5e-4  # seconds; from here on a process of its own is faster than taking turns
@@ -101,7 +109,7 @@ def _process(make: Make, task: str, seed: int | None, timeout: float) -> Iterato
     """A function that returns the next answer of `_look`, or a Failure."""
     try:
         context: Any = multiprocessing.get_context(start_method())
-        with unbroken():
+        with starting():
             ours, theirs = context.Pipe(duplex=False)
             process = context.Process(
                 target=_look, args=(CloudpickleWrapper(functools.partial(make, 0)), task, seed, theirs), daemon=True

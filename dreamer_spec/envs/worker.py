@@ -18,9 +18,8 @@ from dreamer_spec.envs.adapter import ContractEnv, where
 from dreamer_spec.envs.failure import Failure
 from dreamer_spec.envs.guest import guest
 from dreamer_spec.envs.history import History
-from dreamer_spec.envs.process import DYING, ended, no_answer, not_started, start_method
+from dreamer_spec.envs.process import DYING, ended, no_answer, not_started, start_method, starting
 from dreamer_spec.envs.stream import Step, StreamEnv
-from dreamer_spec.system.signals import unbroken
 from dreamer_spec.translation import Translation
 
 # What Gymnasium raises where the process has ended: when something is received, when it is sent, and when that had
@@ -108,7 +107,7 @@ class OwnProcess:
 
     def _start(self) -> None:
         try:
-            with unbroken():
+            with starting():
                 makers = [self._make_stream]
                 self._envs = AsyncVectorEnv(
                     makers, copy=False, context=start_method(), autoreset_mode=AutoresetMode.DISABLED

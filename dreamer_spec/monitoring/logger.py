@@ -5,7 +5,7 @@ import json
 import math
 import os
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, BinaryIO, cast
@@ -26,6 +26,7 @@ from dreamer_spec.errors import UserError, writing
 PLAIN_EVERY = 10.0  # seconds between lines where there is no terminal
 
 Picture = Path | np.ndarray
+Watch = Callable[[int, dict[str, float]], object]
 
 
 class Logger:
@@ -40,7 +41,8 @@ class Logger:
     new file.
     wandb: a project of Weights & Biases; needs `about`, of dreamer_spec/disk/about.py, whose `id` lets a resumed run
     continue where it was.
-    warnings: what was wrong with the file.
+    watch: called with step and metrics of each line, when it has been written; what it raises ends the run.
+    warnings: what was wrong with the file. stopped: whether `watch` has returned False.
 
     Raises:
       UserError: the disk refuses it, the file is another program's, or Weights & Biases is not installed or does not
@@ -48,8 +50,16 @@ class Logger:
     """
 
     def __init__(
-        self, logdir: Path, position: int | None = None, *, wandb: str | None = None, about: About | None = None
+        self,
+        logdir: Path,
+        position: int | None = None,
+        *,
+        wandb: str | None = None,
+        about: About | None = None,
+        watch: Watch | None = None,
     ) -> None:
+        self.stopped = False
+        self._watch = watch
         self._path = logdir / "metrics.jsonl"
         with writing(self._path):
             self._file = _open_log(self._path)
@@ -70,6 +80,9 @@ class Logger:
             self._tensorboard.scalars(values, step)
         if self._wandb:
             self._wandb.log(values, step)
+        if self._watch:
+            answer = self._watch(step, values)
+            self.stopped |= isinstance(answer, bool | np.bool_) and not answer
 
     def picture(self, name: str, picture: Picture, step: int) -> None:
         """An image for TensorBoard and Weights & Biases: a PNG or GIF file, or uint8 [H, W], [H, W, 1] or [H, W, 3]."""

@@ -108,12 +108,14 @@ def next_commands(options: Options, step: int) -> list[str]:
     """What can be done with a run that has ended at this environment step, ready to be typed."""
     train, run = program(), shlex.quote(str(options.logdir))
     task = f" --task {shlex.quote(options.task)}" if names_code(options.task) else ""
-    return [
-        f"{train} report {run}",
-        f"{train} eval {run} --episodes 100{task}",
-        f"{train} export {run} policy",
-        f"{train} resume {run} --steps {2 * max(step, first_train_step(options))}{task}",
-    ]
+    commands = {
+        "report": f"{train} report {run}",
+        "eval": f"{train} eval {run} --episodes 100{task}",
+        "export": f"{train} export {run} policy",
+        "resume": f"{train} resume {run} --steps {2 * max(step, first_train_step(options))}{task}",
+    }
+    with_code = ("eval", "resume") if options.make else ()  # A callable of a script that may have no other name.
+    return [command for name, command in commands.items() if name not in with_code]
 
 
 def program() -> str:

@@ -59,7 +59,7 @@ class Signals:
             yield
         finally:
             for number, handler in self._previous.items():
-                signal.signal(number, handler)
+                signal.signal(number, signal.SIG_DFL if handler is None else handler)  # None: one that is not Python's
             signal.set_wakeup_fd(wakeup)
             theirs.close()  # The thread ends.
 

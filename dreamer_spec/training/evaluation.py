@@ -1,7 +1,7 @@
 """Episodes that are played but not learned from: evaluation of the agent, and what a random policy gets."""
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,13 +29,13 @@ class Interrupted(Exception):
     """Somebody asked the run to end."""
 
 
-def play(envs: Environments, act: Act, episodes: int, seeds: list[int], interrupted: Sequence[int] = ()) -> list[float]:
+def play(envs: Environments, act: Act, episodes: int, seeds: list[int]) -> list[float]:
     """The returns of `episodes` whole episodes, as `play_episodes` plays them."""
-    return [episode.score for episode in play_episodes(envs, act, episodes, seeds, interrupted)]
+    return [episode.score for episode in play_episodes(envs, act, episodes, seeds)]
 
 
 def play_episodes(
-    envs: Environments, act: Act, episodes: int, seeds: list[int], interrupted: Sequence[int] = ()
+    envs: Environments, act: Act, episodes: int, seeds: list[int], interrupted: Callable[[], bool] = lambda: False
 ) -> list[Episode]:
     """Scores and lengths of `episodes` whole episodes: [LOOP-20].
 
@@ -44,7 +44,7 @@ def play_episodes(
 
     Raises:
       UserError: an episode that does not end.
-      Interrupted: `interrupted` is no longer empty.
+      Interrupted: `interrupted` says so.
     """
     share = np.full(envs.count, episodes // envs.count) + (np.arange(envs.count) < episodes % envs.count)
     played: list[list[Episode]] = [[] for _ in range(envs.count)]
@@ -59,7 +59,7 @@ def play_episodes(
         unfinished = [len(ended) < wanted for ended, wanted in zip(played, share, strict=True)]
         if not any(unfinished):
             return [episode for ended in played for episode in ended]
-        if interrupted:
+        if interrupted():
             raise Interrupted
         if length[unfinished].max() > LONGEST_EPISODE:
             raise UserError(
@@ -104,13 +104,13 @@ class Agent:
 
 
 def evaluate(
-    act: Act, envs: Environments, episodes: int, seed: int, earlier: int, interrupted: Sequence[int] = ()
+    act: Act, envs: Environments, episodes: int, seed: int, earlier: int, interrupted: Callable[[], bool]
 ) -> list[Episode]:
     """Episodes of the agent as it is now, sampling its actions: [LOOP-18], [LOOP-19]. earlier: evaluations of this run
     before.
 
     Raises:
-      Interrupted: `interrupted` is no longer empty.
+      Interrupted: `interrupted` says so.
     """
     seeds = [derive_seed(seed, "evaluation_environment", worker + envs.count * earlier) for worker in range(envs.count)]
     return play_episodes(envs, act, episodes, seeds, interrupted)

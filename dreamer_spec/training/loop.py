@@ -8,6 +8,7 @@ import numpy as np
 
 from dreamer_spec.backend import Learner
 from dreamer_spec.envs import Record
+from dreamer_spec.monitoring.logger import Watch
 from dreamer_spec.options import Options
 from dreamer_spec.system.signals import Stopped, stoppable
 from dreamer_spec.training import resume
@@ -19,11 +20,12 @@ from dreamer_spec.training.state import TrainingRun, TrainStep
 from reference_numpy.training_loop import can_train, derive_seed
 
 
-def run(options: Options, learner: type[Learner] | None = None) -> bool:
+def run(options: Options, learner: type[Learner] | None = None, watch: Watch | None = None) -> bool:
     """Trains as the options say, or continues. Returns whether it came to the end; False after Ctrl-C, with a
     checkpoint.
 
-    learner: the class to train instead of the backend's.
+    learner: the class to train instead of the backend's. watch: called with step and metrics of each line that is
+    written; if it returns False, the run ends as after Ctrl-C.
 
     Raises:
       UserError: whatever the user can mend; see dreamer_spec/cli.py.
@@ -32,7 +34,7 @@ def run(options: Options, learner: type[Learner] | None = None) -> bool:
     with stoppable() as signals, signals.polled(), ExitStack() as stack:
         try:
             with signals.polled(False):
-                run = prepare(options, learner, stack)
+                run = prepare(options, learner, stack, watch)
         except KeyboardInterrupt as error:
             raise Stopped("before training began: there was nothing to save, and nothing is lost") from error
         return train(run) and finish(run)
@@ -42,7 +44,7 @@ def train(run: TrainingRun) -> bool:
     """Acts, remembers and learns until the budget of steps is used up. Returns False if Ctrl-C ended it; then a
     checkpoint is written."""
     with stoppable() as signals, signals.polled():
-        run.interrupted = signals.received
+        run.signals = signals.received
         schedule = Schedule(run)
         if not run.shares_environment:
             schedule.evaluate(run)
@@ -63,7 +65,7 @@ def train(run: TrainingRun) -> bool:
             schedule.save(run)
         if run.interrupted:
             path = resume.save(run)
-            run.display.say(f"interrupted at step {run.step:,}, saved in {path}; the same command continues from here")
+            run.display.say(f"{run.ending} at step {run.step:,}, saved in {path}; the same command continues from here")
     return not run.interrupted
 
 

@@ -152,7 +152,7 @@ def run_evaluation(run: TrainingRun) -> bool:
     try:
         with run.envs.lend() if run.shares_environment else contextlib.nullcontext():
             episodes = evaluate(
-                act, run.test_envs, options.eval_episodes, options.seed, counters.evaluations, run.interrupted
+                act, run.test_envs, options.eval_episodes, options.seed, counters.evaluations, lambda: run.interrupted
             )
     except Interrupted:
         return False
@@ -208,7 +208,7 @@ def finish(run: TrainingRun) -> bool:
         path = resume.save(run)  # An evaluation may take long, and whatever ends it must not cost the training.
         if not run_evaluation(run):
             run.display.say(
-                f"interrupted in the last evaluation, all training is saved in {path}; the same command plays it again"
+                f"{run.ending} in the last evaluation, all training is saved in {path}; the same command plays it again"
             )
             return False
         resume.save(run)

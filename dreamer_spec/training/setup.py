@@ -2,6 +2,7 @@
 
 import math
 import os
+from collections.abc import Callable
 from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,10 +13,10 @@ from dreamer_spec.backend import Learner, learner_class
 from dreamer_spec.disk import checkpoint, logdir
 from dreamer_spec.disk.about import About, write_about
 from dreamer_spec.disk.checkpoint import Checkpoint
-from dreamer_spec.envs import Environments, Record, doubts, env_maker, try_out
+from dreamer_spec.envs import ContractEnv, Environments, Record, Trial, doubts, env_maker, try_out
 from dreamer_spec.envs.frames import repeated_twice
 from dreamer_spec.errors import UserError
-from dreamer_spec.monitoring.logger import Display, Logger
+from dreamer_spec.monitoring.logger import Display, Logger, Watch
 from dreamer_spec.monitoring.outcome import mean_of
 from dreamer_spec.options import Options
 from dreamer_spec.replay import Prefetcher, Replay, erase
@@ -34,7 +35,9 @@ if TYPE_CHECKING:
     from conformance.preflight import Report
 
 
-def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -> TrainingRun:
+def prepare(
+    options: Options, learner: type[Learner] | None, stack: ExitStack, watch: Watch | None = None
+) -> TrainingRun:
     """Everything that can go wrong is tried here, the cheap things first. What must be closed is left to the stack."""
     _require_trainable(options)
     is_new = not options.logdir.exists()
@@ -78,7 +81,7 @@ def prepare(options: Options, learner: type[Learner] | None, stack: ExitStack) -
         origin=origin,
         understood=envs.translation.lines,
     )
-    logger = Logger(options.logdir, saved.info["log"] if saved else None, wandb=options.wandb, about=about)
+    logger = Logger(options.logdir, saved.info["log"] if saved else None, wandb=options.wandb, about=about, watch=watch)
     run = TrainingRun(
         options=options,
         envs=envs,
@@ -204,18 +207,22 @@ def import_learner(backend: str) -> type[Learner]:
         ) from error
 
 
+def try_environment(options: Options, make: Callable[[int], ContractEnv], display: Display) -> Trial | None:
+    """What an environment in a process of its own shows; None where none shall have one."""
+    if options.processes == "no":
+        return None
+    seed = options.seed if options.processes == "auto" else None
+    return try_out(make, lambda failure: report_failure(failure, display.say), options.task, seed, options.env_timeout)
+
+
 def _make_environments(
     options: Options, display: Display, stack: ExitStack
 ) -> tuple[Environments, Environments | None]:
     """The environments of training, and those of evaluation if there is any."""
     make = env_maker(options)
-    trial = None
     if options.processes != "no":
         display.phase("an environment is tried out")
-        seed = options.seed if options.processes == "auto" else None
-        trial = try_out(
-            make, lambda failure: report_failure(failure, display.say), options.task, seed, options.env_timeout
-        )
+    trial = try_environment(options, make, display)
 
     def several(count: int) -> Environments:
         processes = trial is not None and trial.deserves_process

@@ -82,7 +82,7 @@ class TrainingRun:
     """Everything that a run is made of.
 
     record, carry: the newest records of the environments, and the policy's carry before it has seen them.
-    interrupted: the signals that asked the run to end.
+    signals: those that asked the run to end.
     """
 
     options: Options
@@ -106,7 +106,17 @@ class TrainingRun:
     returns: collections.deque[float] = dataclasses.field(
         default_factory=lambda: collections.deque(maxlen=20)
     )  # of the last episodes
-    interrupted: list[int] = dataclasses.field(default_factory=list)
+    signals: list[int] = dataclasses.field(default_factory=list)
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether the run shall end early: by a signal, or because somebody who watches its metrics wants it."""
+        return bool(self.signals) or self.logger.stopped
+
+    @property
+    def ending(self) -> str:
+        """How the run ends early, as a word for messages."""
+        return "interrupted" if self.signals else "stopped by the callback"
 
     @property
     def shares_environment(self) -> bool:
