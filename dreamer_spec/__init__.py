@@ -3,17 +3,17 @@
 The rooms by level, the lowest first. A module imports from lower levels and from its own room: never from above, never
 from another room of its level, never in a circle. tests/test_repository.py reads this table and checks it.
 
-  errors, words                         what the user can mend, in one line; how counts are said
-  system                                the process and its machine: cores, memory, threads, signals
-  arguments, backend, options, resize   what a run is, and the interface to what trains
-  translation                           an environment's values as arrays, and flat actions as the environment's
-  disk                                  what a run leaves: its record, checkpoints, incidents, and reading without trust
-  envs, policy, replay                  environments; a trained agent with NumPy alone; the buffer of chapter 11
-  monitoring                            what people see of a run: metrics, progress, curve, predictions, films, outcome
-  report, training                      the HTML page about runs; a run from its options to its end
-  commands                              the names of the commands beside training
-  cli                                   the command line
-  commands.*, __main__                  what each command does
+  errors, own_packages, words                  what the user can mend, in one line; how counts are said
+  system                                       the process and its machine: cores, memory, threads, signals
+  arguments, backend, kinds, options, resize   what a run is, and the interface to what trains
+  translation                                  an environment's values as arrays, and flat actions as the environment's
+  disk                                         what a run leaves: record, checkpoints, incidents; reading without trust
+  envs, policy, replay                         environments; a trained agent with NumPy alone; the buffer of chapter 11
+  monitoring, option_table                     what people see of a run; the options as one table
+  report, training                             the HTML page about runs; a run from its options to its end
+  api, commands                                the interface from Python; the names of the commands beside training
+  cli                                          the command line
+  commands.*, __main__                         what each command does
 
 From Python: docs/python.md. The names below are imported when they are asked for, so that `import dreamer_spec` costs
 nothing.
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from dreamer_spec.errors import UserError
     from dreamer_spec.options import Options
     from dreamer_spec.policy import Policy
-    from dreamer_spec.separate_evaluation import Evaluation
+    from dreamer_spec.training.separate_evaluation import Evaluation
 
 __all__ = [
     "Evaluation",
@@ -41,7 +41,12 @@ __all__ = [
     "train",
 ]
 
-_PLACES = {"Evaluation": "separate_evaluation", "Options": "options", "Policy": "policy", "UserError": "errors"}
+_PLACES = {
+    "Evaluation": "training.separate_evaluation",
+    "Options": "options",
+    "Policy": "policy",
+    "UserError": "errors",
+}
 
 
 def __getattr__(name: str) -> Any:

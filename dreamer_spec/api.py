@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from dreamer_spec.monitoring.outcome import Mean
     from dreamer_spec.policy import Policy
-    from dreamer_spec.separate_evaluation import Evaluation
+    from dreamer_spec.training.separate_evaluation import Evaluation
 
 Folder = str | os.PathLike[str]
 Callback = Callable[[int, dict[str, float]], object]
@@ -180,7 +180,7 @@ def evaluate(
         folder = RUN.of_value("run", given.pop("run"))
         given["task"], make = _named(task)
         values = checked(given, EVAL_OPTIONS)
-        from dreamer_spec.separate_evaluation import evaluate_checkpoint
+        from dreamer_spec.training.separate_evaluation import evaluate_checkpoint
 
         return evaluate_checkpoint(folder, make=make, **values)
 

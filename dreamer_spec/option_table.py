@@ -29,6 +29,7 @@ from dreamer_spec.kinds import (
 from dreamer_spec.options import (
     BACKENDS,
     DEFAULT_PRESET,
+    DETER_DTYPES,
     EVAL_ENV,
     NONFINITE,
     PROCESSES,
@@ -39,7 +40,6 @@ from dreamer_spec.options import (
     did_you_mean,
     presets,
 )
-from dreamer_spec.replay.layout import DETER_DTYPES
 from spec import built_profiles, hyperparameters, profiles, sizes
 
 ENV_ARG = Kind(

@@ -21,6 +21,7 @@ NONFINITE = ("stop", "skip")
 CHANGEABLE_GROUPS = ("world_model", "behavior", "optimizer")  # of spec/hyperparameters.toml: [LOOP-70]
 TRAIN_WHEN = ("always", "between-episodes")
 EVAL_ENV = ("own", "shared")
+DETER_DTYPES = ("bfloat16", "float32")  # of the latents in the buffer
 
 
 @dataclasses.dataclass(frozen=True)

@@ -48,6 +48,6 @@ import dreamer_spec.training.setup
 from dreamer_spec import make_options, train
 from train_fakes import Counting, FakeLearner, Sleepy
 
-dreamer_spec.setup.learner_class = lambda backend: FakeLearner
+dreamer_spec.training.setup.learner_class = lambda backend: FakeLearner
 SHORT = {SHORT!r}
 """

@@ -2,6 +2,7 @@
 docs/python.md."""
 
 import ast
+import importlib
 import inspect
 import json
 import os
@@ -71,7 +72,7 @@ def test_type_checkers_see_what_is_there() -> None:
     }
     assert sorted(imported) == dreamer_spec.__all__
     for name, module in imported.items():
-        assert getattr(dreamer_spec, name).__module__ == module
+        assert getattr(dreamer_spec, name) is getattr(importlib.import_module(module), name)
     assert (ROOT / "dreamer_spec" / "py.typed").exists()
     with pytest.raises(AttributeError, match="no attribute 'lern'"):
         dreamer_spec.lern  # noqa: B018

@@ -11,7 +11,7 @@ import train_fakes
 from train_agents import random_learner_state, save_checkpoint
 from train_runs import logged
 
-import dreamer_spec.separate_evaluation
+import dreamer_spec.training.separate_evaluation
 from conformance.adapters import jax_adapter, torch_adapter
 from conformance.problems import Problem, random_batch, small_config, train_noise, with_sampling_margin
 from dreamer_spec.backend import learner_class
@@ -20,7 +20,7 @@ from dreamer_spec.disk import checkpoint
 from dreamer_spec.disk.checkpoint import open_checkpoint
 from dreamer_spec.envs import Environments, make_env
 from dreamer_spec.replay import Replay
-from dreamer_spec.separate_evaluation import Evaluation
+from dreamer_spec.training.separate_evaluation import Evaluation
 from reference_numpy import agent as reference
 from reference_numpy.training_loop import derive_seed
 from spec import Config, Discrete, Image, Spaces, Vector, parameter_table
@@ -120,7 +120,7 @@ def test_seeds_are_not_those_of_the_runs_own_evaluations(counting: str, monkeypa
 
     monkeypatch.setattr(Environments, "reset", recorded)
     assert main(["eval", counting, *COUNT, "2"]) == 0
-    separate = derive_seed(0, "separate_evaluation", 0)
+    separate = derive_seed(0, "training.separate_evaluation", 0)
     assert given == [[derive_seed(separate, "evaluation_environment", worker) for worker in range(2)]]
     assert not {derive_seed(0, "evaluation_environment", index) for index in range(10_000)}.intersection(given[0])
 
@@ -149,7 +149,7 @@ def test_an_action_that_is_not_finite_ends_the_evaluation(
     counting: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(
-        dreamer_spec.separate_evaluation.Agent, "__call__", lambda self, record: np.full((1, 2), np.nan)
+        dreamer_spec.training.separate_evaluation.Agent, "__call__", lambda self, record: np.full((1, 2), np.nan)
     )
     assert "the action is not finite" in refusal(capsys, counting, *COUNT, "1")
 
@@ -306,5 +306,5 @@ def test_a_result_that_cannot_be_written_is_refused_before_an_episode(
     name: str,
     reason: str,
 ) -> None:
-    monkeypatch.setattr(dreamer_spec.separate_evaluation, "play", pytest.fail)
+    monkeypatch.setattr(dreamer_spec.training.separate_evaluation, "play", pytest.fail)
     assert reason in refusal(capsys, counting, *COUNT, "1", "--json", str(tmp_path / name))

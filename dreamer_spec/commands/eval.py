@@ -10,7 +10,7 @@ from dreamer_spec.cli import Formatter, Parser
 from dreamer_spec.disk.files import replacing, require_place
 from dreamer_spec.errors import writing
 from dreamer_spec.option_table import EVAL_OPTIONS
-from dreamer_spec.separate_evaluation import evaluate_checkpoint
+from dreamer_spec.training.separate_evaluation import evaluate_checkpoint
 from dreamer_spec.words import counted
 
 DESCRIPTION = """Play episodes with the agent of a checkpoint. It samples its actions, as in training, unless --mode is

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from dreamer_spec.options import DETER_DTYPES
 from reference_numpy.shapes import require_shape
 
 Sections = list[NDArray[np.uint8]]
@@ -31,7 +32,6 @@ TYPES: dict[str, type[np.generic]] = {
 }
 VECTORS = ("action", "deter", "stoch")
 LATENTS = ("deter", "stoch")
-DETER_DTYPES = ("bfloat16", "float32")
 LARGE = 512  # bytes: from here on an observation has a section of its own, so that sampling does not copy it twice
 _MOST_BYTES = 2**31  # of one record: nothing sensible comes near
 

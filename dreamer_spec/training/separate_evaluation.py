@@ -120,7 +120,7 @@ def evaluate_checkpoint(
         config=saved.config,
         logdir=checkpoint.path,
         steps=0,
-        seed=derive_seed(seed, "separate_evaluation", 0),
+        seed=derive_seed(seed, "training.separate_evaluation", 0),
         device=device,
         action_repeat=saved.info["action_repeat"],
         image_size=saved.info["image_size"],
