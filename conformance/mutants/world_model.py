@@ -259,7 +259,7 @@ MUTANTS = (
             "world_model.open_loop": {
                 "np.asarray(observation[key])[:, :context]": "np.asarray(observation[key])",
                 "prev_action[:, :context], is_first[:, :context]": "prev_action, is_first",
-                'noise["posterior"]': 'np.concatenate([noise["posterior"], prior_noise], axis=1)',
+                "posterior_noise, config": "np.concatenate([posterior_noise, prior_noise], axis=1), config",
                 "for t in range(context, steps)": "for t in range(0)",
             }
         },
@@ -273,9 +273,9 @@ MUTANTS = (
         edits={
             "world_model.open_loop": {
                 "seen = {key:": (
-                    'uniform = np.concatenate([noise["posterior"], prior_noise], axis=1)\n'
+                    "uniform = np.concatenate([posterior_noise, prior_noise], axis=1)\n"
                     "    context = min(context + 1, steps - 1)\n"
-                    '    noise, prior_noise = {"posterior": uniform[:, :context]}, uniform[:, context:]\n'
+                    "    posterior_noise, prior_noise = uniform[:, :context], uniform[:, context:]\n"
                     "    seen = {key:"
                 )
             }
