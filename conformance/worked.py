@@ -1,23 +1,23 @@
 """The worked numbers of the chapters (spec/examples) as calls, for checks and tests.
 
-In a check, with the rounding that the function may have beyond the example's own precision:
+In a check, a case for each example, with the rounding that it allows:
 
-  for case in worked("returns", "a return by hand", "weights by hand", profile=run.profile):
-      actual = run.call(case.function, *case.arguments)
-      run.compare(case.name, actual, case.expected, magnitude=case.allowed(16 * run.u), bound=1.0)
+  yield from worked_cases(setting, "returns", "a return by hand", "the ends of lambda")  # equal in every bit
+  yield from worked_cases(setting, "returns", "a return with the real constants", bound=64 * setting.u)
 
-The names are those of spec/examples/returns.toml; without any, all of the row come, in its order. An example that
-lists several cases comes as several. One of an object has `calls` instead of an expected result:
+The names are those of spec/examples/returns.toml. An example that lists several cases comes as several. What else is to
+be done with them starts from `worked`; without names, all of the row come, in its order. An example of an object has
+`calls` in place of a result:
 
   for case in worked("training_loop", "no drift"):
-      made = run.call(case.function, *case.arguments)
+      made = script.call(case.function, *case.arguments)
       for call in case.calls:
           actual = (getattr(made, call.function) if call.function else made)(*call.arguments)
           if call.expected is not None:
-              run.compare(call.name, actual, call.expected, magnitude=call.allowed(), bound=1.0)
+              script.compare(call.name, actual, call.expected, magnitude=1.0, bound=0.0)
 
 Arguments are in the order of the interface: NumPy arrays of float64, booleans, or the dtype that the file names, not
-rounded to the dtype of a run; mappings of these; Spaces and Config.
+rounded to the dtype of a setting; mappings of these; Spaces and Config.
 """
 
 import copy
@@ -28,7 +28,9 @@ from typing import Any
 
 import numpy as np
 
-from conformance.adapter import INTERFACE, RESULTS, load_adapter
+from conformance.adapter import INTERFACE, RESULTS, Adapter, Array, load_adapter
+from conformance.case import Cases, Setting, equal
+from conformance.compare import WIDE, round_to
 from conformance.problems import small_config
 from spec import Spaces, Vector, parameter_table
 from spec.worked import Call, Case, Example, examples
@@ -52,10 +54,6 @@ class Worked:
     bound: Any = None
     calls: tuple["Worked", ...] = ()
 
-    def allowed(self, rounding: float = 0.0) -> Any:
-        """The bound, plus the rounding of another precision, relative to what is expected."""
-        return _combine(lambda bound, value: bound + rounding * np.abs(value), self.bound, self.expected)
-
 
 def worked(row: str, *names: str, profile: str = "paper", dtype: str = "float64") -> tuple[Worked, ...]:
     """The cases of the named examples of a row, or of all.
@@ -69,6 +67,36 @@ def worked(row: str, *names: str, profile: str = "paper", dtype: str = "float64"
     if unknown := [name for name in names if name not in known]:
         raise ValueError(f"{row} has no example {unknown[0]!r}; known: {', '.join(known)}")
     return tuple(case for name in names or known for case in _cases(known[name], profile, dtype))
+
+
+# Arguments that are float32 or better in every compute dtype.
+WIDE_ARGUMENTS = ("bins", "uniform", "noise", "normal")
+
+
+def worked_cases(setting: Setting, row: str, *names: str, floor: float = 0.0, bound: float = 0.0) -> Cases:
+    """A case for each case of the named examples. The arguments are rounded to what the candidate can hold, and the
+    result is what the reference makes of these, with all its digits: tests compare it with those that are written.
+
+    bound: the deviation that is allowed, relative to each number, or to `floor` where the number is smaller; without
+    it, results are equal in every bit but the sign of zero.
+    """
+    for case in worked(row, *names, profile=setting.profile, dtype=setting.dtype):
+        arguments = tuple(map(functools.partial(_held, setting), INTERFACE[case.function], case.arguments))
+        expected = getattr(_reference(), case.function)(*copy.deepcopy(arguments))
+        where = f"{case.function}, {case.name.partition(': ')[2]}"
+        magnitude = _combine(lambda value: np.maximum(np.abs(value), floor), expected) if bound else 1.0
+        yield equal(case.function, arguments, expected, where=where, magnitude=magnitude, bound=bound)
+
+
+def _held(setting: Setting, name: str, value: Any) -> Any:
+    """An argument as the candidate can hold it."""
+    if isinstance(value, Mapping):
+        return {key: _held(setting, name, entry) for key, entry in value.items()}
+    if not isinstance(value, np.ndarray) or value.dtype.kind != "f":
+        return value
+    if name in ("observation", "observations"):
+        return value.astype(np.float32)
+    return round_to(value, WIDE[setting.dtype]) if name in WIDE_ARGUMENTS else setting.cast(value)
 
 
 def _cases(example: Example, profile: str, dtype: str) -> list[Worked]:
@@ -97,11 +125,16 @@ def _object(example: Example, name: str) -> Worked:
     made = getattr(_reference(), example.function)(*arguments)
     calls = []
     for n, case in enumerate(example.cases, 1):
-        given = copy.deepcopy(tuple(case.arguments.values()))
+        given = tuple(map(_entries_as_arrays, copy.deepcopy(tuple(case.arguments.values()))))
         result = (getattr(made, case.method) if case.method else made)(*copy.deepcopy(given))
         expected, bound = (None, None) if case.expected is None else _whole(case.method, case, result)
         calls.append(Worked(f"{name}, {n}", case.method, given, expected, bound))
     return Worked(name, example.function, arguments, calls=tuple(calls))
+
+
+def _entries_as_arrays(value: Any) -> Any:
+    """Records hold arrays, also where the file has a single number."""
+    return {key: np.asarray(entry) for key, entry in value.items()} if isinstance(value, Mapping) else value
 
 
 @functools.cache
@@ -121,7 +154,10 @@ def _in_order(function: str, given: Mapping[str, Any], profile: str, dtype: str)
     for group in ("params", "slow_critic"):
         if "others" in arguments.get(group, {}):
             arguments[group] = _all_parameters(arguments, group)
-    return tuple(arguments[name] for name in INTERFACE[function])
+    kinds = getattr(Adapter, function).__annotations__
+    return tuple(
+        np.asarray(arguments[name]) if kinds[name] is Array else arguments[name] for name in INTERFACE[function]
+    )
 
 
 def _all_parameters(arguments: Mapping[str, Any], group: str) -> dict[str, np.ndarray]:

@@ -151,19 +151,20 @@ def lambda_return(reward: Any, continue_: Any, value: Any, discount: float, lamb
 
 
 def test_shapes_are_explained() -> None:
-    """Expected, got, and the usual reason."""
+    """Expected, got, and the usual reason, of the function and the worked number."""
+    where = "lambda_return, a return by hand"
     swapped = run(
         "returns.lambda_return_literals", module(lambda_return=lambda *arguments: lambda_return(*arguments).T)
     )
-    assert swapped.message == "lambda_return: expected shape (1, 3), got (3, 1): rows come first and time comes second"
+    assert swapped.message == f"{where}: expected shape (1, 3), got (3, 1): rows come first and time comes second"
     longer = run(
         "returns.lambda_return_literals", module(lambda_return=lambda *arguments: lambda_return(*arguments)[..., None])
     )
-    assert longer.message == "lambda_return: expected shape (1, 3), got (1, 3, 1): leave out the last axis"
+    assert longer.message == f"{where}: expected shape (1, 3), got (1, 3, 1): leave out the last axis"
     shorter = run(
         "returns.lambda_return_literals", module(lambda_return=lambda *arguments: lambda_return(*arguments)[:, 1:])
     )
-    assert shorter.message == "lambda_return: expected shape (1, 3), got (1, 2)"
+    assert shorter.message == f"{where}: expected shape (1, 3), got (1, 2)"
 
 
 @pytest.mark.parametrize(

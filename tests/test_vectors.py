@@ -17,6 +17,7 @@ from conformance import cli
 from conformance.adapter import INTERFACE, load_adapter
 from conformance.adapters.numpy_adapter import NumpyAdapter
 from conformance.check import CHECKS
+from conformance.compare import DTYPES, EPSILON, WIDE
 from conformance.errors import UserError
 from conformance.mutants import MUTANTS, MutantAdapter
 from conformance.vectors import format as vector_format
@@ -225,10 +226,8 @@ def test_what_is_made_of_the_candidates_own_results_is_no_golden_value() -> None
     all."""
     assert record(CHECKS["returns.lambda_return_ignores_the_start"], "paper", 0, 2) == []
     vectors = record(CHECKS["returns.lambda_return_literals"], "paper", 0, 2)
-    assert [vector.outputs[0].tolerance for vector in vectors] == [
-        {"float64": 0.0, "float32": 0.0, "bfloat16": 0.0},
-        {"float64": 5e-5, "float32": 5e-5, "bfloat16": 5e-5},
-    ]
+    exact, rounded = dict.fromkeys(DTYPES, 0.0), {dtype: 64 * EPSILON[WIDE[dtype]] for dtype in DTYPES}
+    assert [vector.outputs[0].tolerance for vector in vectors] == [exact] * 5 + [rounded] * 3
     assert vectors[0].outputs[0].expected.tolist() == [[2.28125, 1.125, 7.0]]
 
 

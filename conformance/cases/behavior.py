@@ -1,7 +1,6 @@
 """Checks of spec/08-behavior.md."""
 
 import math
-from collections.abc import Iterator
 from typing import Any
 
 import hypothesis.strategies as st
@@ -9,16 +8,16 @@ import numpy as np
 
 from conformance.case import Cases, Drawn, Equal, Setting, equal, exact, exactly, judged, refused, related
 from conformance.cases.agent import WHOLE, problem_of
+from conformance.cases.distributions import LITERAL
 from conformance.check import check
 from conformance.compare import Comparisons, round_to
 from conformance.problems import action_noise, small_config
 from conformance.strategies import normals, seeds
+from conformance.worked import worked, worked_cases
 from reference_numpy import behavior as reference
 from reference_numpy import distributions
 from spec import Config, Discrete, Spaces, Vector
 
-# Numbers in the chapter have seven digits; in bfloat16 already the rounded inputs move the results by a percent.
-LITERAL = {"float64": 1e-6, "float32": 4e-6, "bfloat16": 3e-2}
 LEADING = st.sampled_from([(), (2, 3)])
 # Given unsorted; in sorted order Aim, buttons, one, turn: 1 + 5 + 1 + 2 numbers in a flat action, 1 + 2 + 1 + 2 in its
 # noise.
@@ -26,7 +25,6 @@ TASK = Spaces(
     {"x": Vector(1)}, {"turn": Vector(2), "buttons": Discrete((2, 3)), "one": Discrete((1,)), "Aim": Vector(1)}
 )
 DISCRETE = Spaces({"x": Vector(1)}, {"action": Discrete((2,))})
-CONTINUOUS = Spaces({"x": Vector(1)}, {"action": Vector(1)})
 
 
 def random_outputs(
@@ -100,18 +98,10 @@ def action_literals(setting: Setting) -> Cases:
 def discrete_literals(setting: Setting) -> Cases:
     """Logits ln 3, 0 with 1 percent uniform: 0.7475 and 0.2525, boundary at 0.7475, log-probabilities and entropy of
     the mixture."""
-    config = config_of(setting, actor_unimix=0.01)
-    outputs = {"action": {"logits": setting.cast(np.tile([math.log(3), 0], (4, 1)))}}
-    noise = setting.cast(np.array([[0], [0.74], [0.758], [0.99]]))
-    yield exact("sample_action", (outputs, noise, DISCRETE, config), np.eye(2)[[0, 0, 1, 1]], where="sample")
-    bound = LITERAL[setting.dtype]
-    expected = np.array([-0.291021, -1.376344, -0.291021, 0])
-    actions = np.array([[1.0, 0], [0, 1], [1, 0], [0, 0]])
-    yield equal("action_log_prob", (outputs, actions, DISCRETE, config), expected, bound=bound)
-    yield equal("action_entropy", (outputs, DISCRETE, config), np.full(4, 0.565065), bound=bound)
-    plain = config_of(setting, actor_unimix=0.0)
-    expected = np.log([0.75, 0.25, 0.75, 1])
-    yield equal("action_log_prob", (outputs, actions, DISCRETE, plain), expected, magnitude=1.0, bound=bound)
+    yield from worked_cases(setting, "behavior", "a choice of two", "a single class takes its uniform")
+    choices = ("log-probabilities of a choice", "the entropy of a choice")
+    yield from worked_cases(setting, "behavior", *choices, bound=LITERAL[setting.dtype])
+    config, plain = (config_of(setting, actor_unimix=share) for share in (0.01, 0.0))
     # Far logits: finite log-probabilities without the mixture, a floor of ln(u/C) with it; probability 0 has no
     # entropy.
     far, second = {"action": {"logits": np.array([1000.0, 0])}}, np.array([0.0, 1])
@@ -125,15 +115,9 @@ def discrete_literals(setting: Setting) -> Cases:
 def continuous_literals(setting: Setting) -> Cases:
     """Raw 0, 0 and the normal 1.5: action 1.339076, log-density -1.930453, entropy 1.305453; narrow normals have
     negative entropy."""
-    bound, config = LITERAL[setting.dtype], config_of(setting, actor_min_std=0.1, actor_max_std=1.0)
-    outputs = {"action": {"mean": np.zeros(1), "std": np.zeros(1)}}
-    arguments = outputs, np.array([1.5]), CONTINUOUS, config
-    yield equal("sample_action", arguments, np.array([1.339076]), bound=LITERAL["float32"])
-    yield equal("action_log_prob", (outputs, setting.cast([1.339076]), CONTINUOUS, config), -1.930453, bound=bound)
-    yield equal("action_entropy", (outputs, CONTINUOUS, config), 1.305453, bound=LITERAL["float32"])
-    for raw, entropy in ((-100.0, -0.883647), (100.0, 1.418939)):
-        outputs = {"action": {"mean": np.zeros(1), "std": np.array([raw])}}
-        yield equal("action_entropy", (outputs, CONTINUOUS, config), entropy, bound=LITERAL["float32"])
+    of_one = ("a normal action", "the log-density of a normal action", "entropies of a normal action")
+    of_several = ("an action of several keys", "the log-probability of several keys", "the entropy of several keys")
+    yield from worked_cases(setting, "behavior", *of_one, *of_several, bound=LITERAL[setting.dtype])
 
 
 @check("BEH-1", "BEH-2", "BEH-3", "BEH-4", "BEH-22", "CON-16", uses=["sample_action"], level=0)
@@ -183,14 +167,9 @@ def log_prob_and_entropy_match(setting: Setting) -> Cases:
 def actor_loss_literals(setting: Setting) -> Cases:
     """Return 3, value 1, scale 4, weight 0.9: 0.130807. The entropy is rewarded, weighted, and not divided by the
     scale."""
-    config = config_of(setting, entropy_scale=3e-4)
-    one = np.ones((1, 1))
-    log_prob, entropy, weight = (setting.cast(x * one) for x in (-0.291021, 0.565065, 0.9))
-    arguments = (log_prob, entropy, 3 * one, one, weight, 4.0)
-    yield equal("actor_loss", (*arguments, config), np.array([[0.130807]]), bound=LITERAL[setting.dtype] + 4e-6)
-    config = config_of(setting, entropy_scale=0.5, actor_scale=7.0)
-    arguments = (-2 * one, 4 * one, 5 * one, one, 0.5 * one, 8.0)
-    yield exact("actor_loss", (*arguments, config), np.array([[-0.5 * (0.5 * -2 + 0.5 * 4)]]), where="by hand")
+    bound = LITERAL[setting.dtype]
+    yield from worked_cases(setting, "behavior", "an actor loss", "entropy in the actor loss", bound=bound)
+    yield from worked_cases(setting, "behavior", "what the actor loss rewards")
 
 
 @check("BEH-9", "BEH-17", "BEH-22", uses=["actor_loss"], level=0)
@@ -224,34 +203,19 @@ def value_logits(setting: Setting, seed: int, shape: tuple[int, int], bins: int,
 def critic_loss_literals(setting: Setting) -> Cases:
     """Equal logits cost 2 ln 255 whatever the targets; the slow critic is a target as the two-hot of its mean, not as a
     distribution."""
-    config = config_of(setting, bins=255, slow_critic_scale=1.0)
-    flat, returns, weight = np.zeros((1, 3, 255)), np.array([[0.0, -50, 1e12]]), np.array([[1.0, 0.5, 0]])
-    yield equal("critic_loss", (flat, flat, returns, weight, config), 11.082527 * weight, bound=LITERAL["float32"])
-    for arguments, loss, config in losses_towards_the_mean(setting):
-        yield equal("critic_loss", (*arguments, weight, config), loss * weight, bound=LITERAL["float32"])
+    examples = ("critic losses at initialization", "critic losses towards a slow critic")
+    yield from worked_cases(setting, "behavior", *examples, bound=LITERAL[setting.dtype])
 
 
 @check("BEH-12", "BEH-14", uses=["replay_critic_loss"], level=0)
 def replay_critic_loss_literals(setting: Setting) -> Cases:
     """The same, where the last step of an episode costs nothing."""
-    is_last = np.array([[False, True, False]])
-    for arguments, loss, config in losses_towards_the_mean(setting):
-        yield equal("replay_critic_loss", (*arguments, is_last, config), loss * (1 - is_last), bound=LITERAL["float32"])
-
-
-def losses_towards_the_mean(setting: Setting) -> Iterator[tuple[tuple[np.ndarray, ...], float, Config]]:
-    """Logits, slow logits and returns [1, 3], and the loss of each entry, for several shares of the slow critic."""
-    slow = np.full((1, 3, 255), -1e4)
-    slow[..., 127] = slow[..., 129] = 0
-    # -ln softmax is c at the bin 127, c - 8 at 128 and c - 16 at 129; return 0 lies on 127, the mean 0.185103 between
-    # 128 and 129.
-    logits = np.zeros((1, 3, 255))
-    logits[..., 128], logits[..., 129] = 8, 16
-    c = math.log(253 + math.exp(8) + math.exp(16))
-    towards_slow = 0.927147 * (c - 8) + 0.072853 * (c - 16)
-    for share in (1.0, 0.25, 0.0):
-        config = config_of(setting, bins=255, slow_critic_scale=share, critic_scale=5.0, replay_critic_scale=7.0)
-        yield (logits, setting.cast(slow), np.zeros((1, 3))), c + share * towards_slow, config
+    yield from worked_cases(setting, "behavior", "replayed critic losses", bound=LITERAL[setting.dtype])
+    slow, is_last = "critic losses towards a slow critic", np.array([[False, True]])
+    for case in worked("behavior", slow, profile=setting.profile, dtype=setting.dtype):
+        *arrays, _, config = case.arguments
+        arguments = (*(np.repeat(setting.cast(x), 2, axis=1) for x in arrays), is_last, config)
+        yield equal("replay_critic_loss", arguments, case.expected * ~is_last, bound=LITERAL[setting.dtype])
 
 
 @check("BEH-12", "BEH-17", "BEH-22", uses=["critic_loss"], level=0)
@@ -322,19 +286,12 @@ def the_slow_critic_only_regularizes(setting: Setting) -> Cases:
 def slow_critic_literals(setting: Setting) -> Cases:
     """1 towards 2 with decay 0.98 is 1.02; decay 1 freezes, decay 0 copies; other parameters are ignored, arguments
     left alone."""
-    slow = {"critic/a": np.array([1.0, -1]), "critic/b": np.zeros((1, 2))}
-    params = {
-        "critic/a": np.array([2.0, -1]),
-        "critic/b": np.full((1, 2), 50.0),
-        "actor/a": np.zeros(3),
-        "slow_critic": np.zeros(1),
-    }
-    golden = Equal(
-        {"critic/a": np.array([1.02, -1]), "critic/b": np.ones((1, 2))},
-        magnitude={"critic/a": 2.0, "critic/b": 50.0},
-        bound=4 * setting.u,
-    )
-    yield judged("update_slow_critic", (slow, params, 0.98), golden, keeps=True)
+    (case,) = worked("behavior", "an update of the slow critic")
+    slow, critic, decay = case.arguments
+    params = critic | {"slow_critic": np.zeros(1)}
+    magnitude = {name: np.maximum(np.abs(value), np.abs(params[name])) for name, value in slow.items()}
+    golden = Equal(case.expected, magnitude=magnitude, bound=4 * setting.u)
+    yield judged("update_slow_critic", (slow, params, decay), golden, keeps=True)
     for decay, result in ((1.0, slow), (0.0, params)):
         updated = (exactly(result[name], at=(name,), where=f"{name} with decay {decay}") for name in slow)
         yield judged("update_slow_critic", (slow, params, decay), *updated)

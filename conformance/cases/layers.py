@@ -12,6 +12,7 @@ from conformance.compare import EPSILON, WIDE, Comparisons, round_to
 from conformance.problems import random_parameters, small_config, spaces
 from conformance.script import Script
 from conformance.strategies import adversarial_numbers, arrays, normals, seeds
+from conformance.worked import worked, worked_cases
 from reference_numpy import layers as reference
 from reference_numpy import networks
 from spec import Image, Spaces, Vector, parameter_table
@@ -19,10 +20,8 @@ from spec import Image, Spaces, Vector, parameter_table
 LEADING = st.sampled_from([(), (2, 3)])
 SUMS = ("linear", "block_linear", "convolution", "transposed_convolution")
 SCALES = st.sampled_from([1e-3, 1.0, 300.0])
-# Numbers in the chapter have seven digits.
-LITERAL = {"float64": 4e-7, "float32": 4e-7, "bfloat16": EPSILON["bfloat16"]}
-# A truncated normal weight in units of its standard deviation.
-LARGEST = 2.273694468677113
+# Of a few operations.
+LITERAL = {"float64": 1e-12, "float32": 4e-7, "bfloat16": EPSILON["bfloat16"]}
 
 
 def equal_sums(setting: Setting, function: str, arguments: tuple[Any, ...], terms: int, *, roundings: int = 2) -> Case:
@@ -40,34 +39,23 @@ def is_double(actual: Any, expected: np.ndarray) -> bool:
     return np.shape(actual) == expected.shape and np.allclose(actual, expected, rtol=1e-9, atol=0)
 
 
-def pixels(height: int, width: int) -> np.ndarray:
-    """[height, width, 1] with 10i + j at row i and column j."""
-    return (10.0 * np.arange(height)[:, None] + np.arange(width))[..., None]
-
-
 def one_tap(row: int, column: int) -> np.ndarray:
     kernel = np.zeros((5, 5, 1, 1))
     kernel[row, column] = 1
     return kernel
 
 
-ONES = np.ones((5, 5, 1, 1))
-NO_BIAS = np.zeros(1)
+def quantiles() -> np.ndarray:
+    """Truncated normal weights of standard deviation 1 at the uniforms 0, 1/4, 1/2, 3/4 and 0.9."""
+    return np.asarray(worked("layers", "initial weights")[0].expected)
 
 
 @check("LAY-2", "LAY-3", uses=["linear", "block_linear"], level=0)
 def linear_literals(setting: Setting) -> Cases:
     """[1, 2] gives [9.5, 12, 14.5]; with two blocks [1, 2, 3, 4] gives [21, 4301]; one block is a linear layer."""
-    kernel, bias = np.array([[1.0, 2, 3], [4, 5, 6]]), np.array([0.5, 0, -0.5])
-    expected = np.array([9.5, 12, 14.5])
-    yield exact("linear", (np.array([1.0, 2]), kernel, bias), expected)
-    x, blocks = np.array([1.0, 2, 3, 4]), np.array([[[1.0], [10]], [[100], [1000]]])
-    bound = LITERAL[setting.dtype]
-    yield equal("block_linear", (x, blocks, np.array([0.0, 1])), np.array([21.0, 4301]), bound=bound)
-    blocks = np.array([[[1.0, 2], [0, 0]], [[0, 0], [3, 4]]])
-    arguments = (x, blocks, np.array([1.0, 0, 0, 2]))
-    yield exact("block_linear", arguments, np.array([2.0, 2, 12, 18]), where="positions")
-    yield exact("block_linear", (np.array([1.0, 2]), kernel[None], bias), expected, where="one block")
+    positions = ("two outputs per block", "one block is a linear map")
+    yield from worked_cases(setting, "layers", "a linear map", *positions)
+    yield from worked_cases(setting, "layers", "a block-linear map", bound=LITERAL[setting.dtype])
 
 
 @check("LAY-1", "LAY-2", "LAY-3", "LAY-16", "CON-30", uses=["linear", "block_linear"], level=0)
@@ -142,17 +130,11 @@ def rms_norm_literals(setting: Setting) -> Cases:
     """[3, 4] becomes [.8485247, 1.1313663]; epsilon rules tiny rows; zeros stay zero; no mean is taken off; a NaN
     spoils its row only."""
     rounding = LITERAL[setting.dtype]
-    x, scale = np.array([3.0, 4]), np.array([1.0, 1])
-    yield equal("rms_norm", (x, scale, 1e-4), np.array([0.8485247, 1.1313663]), bound=rounding)
-    expected = np.array([1.6970494, -0.5656832])
-    yield equal("rms_norm", (x, np.array([2.0, -0.5]), 1e-4), expected, bound=rounding)
-    yield equal("rms_norm", (np.full(2, 1e-5), scale, 1e-4), np.full(2, 9.999995e-4), bound=2 * rounding)
-    yield exact("rms_norm", (np.zeros((2, 3)), np.ones(3), 1e-4), np.zeros((2, 3)), where="zeros")
-    yield equal("rms_norm", (np.full(3, 2.0), np.ones(3), 1e-4), np.full(3, 0.9999875), bound=rounding)
+    yield from worked_cases(setting, "layers", "a norm", "a norm where epsilon counts", bound=rounding)
     huge = setting.cast([[1e18, -1e18, 1e18, 1e18], [1.0, 1, -1, 1]])
     yield equal("rms_norm", (huge, np.ones(4), 1e-4), np.sign(huge), bound=max(rounding, 1e-4))
     broken, expected = np.array([[1.0, np.nan], [0, 0]]), np.array([[np.nan, np.nan], [0, 0]])
-    yield exact("rms_norm", (broken, scale, 1e-4), expected, where="NaN")
+    yield exact("rms_norm", (broken, np.ones(2), 1e-4), expected, where="NaN")
 
 
 @check("LAY-1", "LAY-4", "LAY-16", uses=["rms_norm"], level=0)
@@ -180,10 +162,10 @@ def rms_norm_matches(setting: Setting) -> Cases:
 @check("LAY-5", uses=["silu"], level=0)
 def silu_literals(setting: Setting) -> Cases:
     """silu of 1, -1, 2 and -20; zeros, infinities, NaN and huge numbers."""
-    x, expected = np.array([1.0, -1, 2]), np.array([0.7310586, -0.2689414, 1.7615942])
-    yield equal("silu", (x,), expected, bound=2 * LITERAL[setting.dtype])
-    if setting.dtype != "bfloat16":
-        yield equal("silu", (np.array([-20.0]),), np.array([-4.1223072e-8]), bound=5e-6)
+    floor = (
+        0.25 if setting.dtype == "bfloat16" else 0.0
+    )  # beside 1, which a sigmoid may add, silu(-20) is nothing there
+    yield from worked_cases(setting, "layers", "silu", floor=floor, bound=2 * LITERAL[setting.dtype])
     special = setting.cast([0.0, -0.0, np.inf, -np.inf, np.nan, -1e30, -3e38, 1e30, 3e38])
     yield exact("silu", (special,), np.array([0, 0, np.inf, np.nan, np.nan, 0, 0, special[7], special[8]]))
 
@@ -211,40 +193,25 @@ def silu_matches(setting: Setting) -> Cases:
 def convolution_literals(setting: Setting) -> Cases:
     """Padding 2 and 2 at stride 1, 1 and 2 at stride 2; taps are not flipped, rows and columns not exchanged; the bias
     comes once."""
-    ones = np.ones((4, 4, 1))
-    for stride, taps in ((1, [3.0, 4, 4, 3]), (2, [4.0, 3])):
-        expected = np.outer(taps, taps)[..., None]
-        yield exact("convolution", (ones, ONES, NO_BIAS, stride), expected, where=f"stride {stride}")
-    yield exact("convolution", (ones, 0 * ONES, np.array([2.5]), 2), np.full((2, 2, 1), 2.5), where="bias")
-    seen = {
-        (0, 0): [[0, 0], [0, 11]],
-        (1, 1): [[0, 2], [20, 22]],
-        (4, 4): [[33, 0], [0, 0]],
-        (1, 2): [[1, 3], [21, 23]],
-    }
-    for tap, image in seen.items():
-        arguments, expected = (pixels(4, 4), one_tap(*tap), NO_BIAS, 2), np.array(image)[..., None]
-        yield exact("convolution", arguments, expected, where=f"tap {tap} at stride 2")
-    expected = np.pad(pixels(4, 6)[:, 1:], ((1, 0), (0, 1), (0, 0)))[:4]
-    yield exact("convolution", (pixels(4, 6), one_tap(1, 3), NO_BIAS, 1), expected, where="tap (1, 3) at stride 1")
+    yield from worked_cases(setting, "layers", "counting taps at stride 1", "counting taps at stride 2")
+    yield from worked_cases(setting, "layers", "where the taps of stride 1 look", "where the taps of stride 2 look")
+    yield from worked_cases(setting, "layers", "channels and leading axes")
+    no_taps, bias = np.zeros((5, 5, 1, 1)), np.array([2.5])
+    yield exact("convolution", (np.ones((4, 4, 1)), no_taps, bias, 2), np.full((2, 2, 1), 2.5), where="bias")
+    pixels = (10.0 * np.arange(4)[:, None] + np.arange(6))[..., None]
+    shifted = np.pad(pixels[:3, 1:], ((1, 0), (0, 1), (0, 0)))
+    yield exact("convolution", (pixels, one_tap(1, 3), np.zeros(1), 1), shifted, where="tap (1, 3) at stride 1")
 
 
 @check("LAY-7", uses=["transposed_convolution"], level=0)
 def transposed_convolution_literals(setting: Setting) -> Cases:
     """A pixel of 1 shows taps 1 and 2, not flipped; ones count the taps 1, 2, 2, 2; the bias comes once to every
     output."""
-    function = "transposed_convolution"
-    kernel = (10.0 * np.arange(5)[:, None] + np.arange(5))[..., None, None]
-    expected = np.array([[11, 12], [21, 22]])[..., None]
-    yield exact(function, (np.ones((1, 1, 1)), kernel, NO_BIAS), expected, where="one pixel")
-    expected = np.outer([1.0, 2, 2, 2], [1.0, 2, 2, 2])[..., None]
-    yield exact(function, (np.ones((2, 2, 1)), ONES, NO_BIAS), expected, where="ones")
-    arguments = (np.ones((2, 3, 1)), 0 * ONES, np.array([2.5]))
-    yield exact(function, arguments, np.full((4, 6, 1), 2.5), where="bias")
+    yield from worked_cases(setting, "layers", "a transposed pixel", "counting transposed taps", "a transposed bias")
     pixel, corner = np.zeros((3, 2, 1)), np.zeros((6, 4, 1))
     pixel[2, 0] = 1
     corner[3, 1] = 1  # from the pixel (2, 0), as 2 * 2 - 1 and 2 * 0 + 1
-    yield exact(function, (pixel, one_tap(0, 2), NO_BIAS), corner, where="tap (0, 2)")
+    yield exact("transposed_convolution", (pixel, one_tap(0, 2), np.zeros(1)), corner, where="tap (0, 2)")
 
 
 @check("LAY-1", "LAY-6", "LAY-7", "LAY-16", "CON-30", uses=["convolution", "transposed_convolution"], level=0)
@@ -289,9 +256,7 @@ IDENTITY = {"a/hidden0/kernel": np.eye(2), "a/hidden0/bias": np.zeros(2), "a/hid
 @check("LAY-8", uses=["dense", "mlp"], level=0)
 def dense_literals(setting: Setting) -> Cases:
     """Linear, then norm, then SiLU: [3, 4] through an identity becomes silu of [.8485247, 1.1313663]."""
-    x, expected, bound = np.array([3.0, 4]), np.array([0.5941859, 0.8554159]), 2 * LITERAL[setting.dtype]
-    yield equal("dense", (IDENTITY, "a/hidden0", x, 1e-4), expected, bound=bound)
-    yield equal("mlp", (IDENTITY, "a", x, 1, 1e-4), expected, bound=bound)
+    yield from worked_cases(setting, "layers", "a dense layer", "an MLP of one layer", bound=2 * LITERAL[setting.dtype])
 
 
 @script("LAY-8", uses=["dense", "mlp"], level=0)
@@ -331,23 +296,17 @@ def mlp_matches(setting: Setting) -> Cases:
 
 @check("LAY-9", "LAY-11", uses=["truncated_normal"], level=0)
 def truncated_normal_literals(setting: Setting) -> Cases:
-    """The quantiles 0, 1/4, 1/2, 3/4 and 0.9; fan 1024 divides by 32; scale 0 gives exact zeros; scalars stay
-    scalars."""
-    function, bound = "truncated_normal", 2e-7 if setting.dtype == "float64" else 1.2e-5
-    quantiles = np.array([-2.2736945, -0.7265726, 0, 0.7265726, 1.3460640])
-    uniform = np.array([0, 0.25, 0.5, 0.75, round_to(0.9, "float32")])
-    yield equal(function, (uniform, 1, 1.0), quantiles, magnitude=1.0, bound=bound)
-    yield equal(function, (uniform[4], 1024, 1.0), 0.0420645, magnitude=1 / 32, bound=4e-6 + bound)
-    column = 0.005 * quantiles[:, None]
-    yield equal(function, (uniform[:, None], 4, 0.01), column, magnitude=0.005, bound=bound)
-    yield exact(function, (uniform, 7, 0.0), np.zeros(5), where="scale 0")
+    """The quantiles 0, 1/4, 1/2, 3/4 and 0.9; fan 1024 divides by 32; scale 0 gives exact zeros."""
+    bound = 1e-10 if setting.dtype == "float64" else 8e-6
+    yield from worked_cases(setting, "layers", "initial weights", floor=1.0, bound=bound)
+    yield from worked_cases(setting, "layers", "initial weights of a fan", bound=bound)
 
 
 @check("LAY-9", "LAY-11", uses=["truncated_normal"], level=0)
 def truncated_normal_matches(setting: Setting) -> Cases:
     """Every quantile, the outermost too; increasing; never beyond 2.2737; the standard deviation is exact."""
     error = 1e-10 if setting.dtype == "float64" else 1e-5
-    grid = (np.arange(4096) + 0.5) / 4096
+    grid, largest = (np.arange(4096) + 0.5) / 4096, -quantiles()[0]
 
     def spread(c: Comparisons, weights: np.ndarray) -> None:
         weights = np.asarray(weights)
@@ -361,7 +320,7 @@ def truncated_normal_matches(setting: Setting) -> Cases:
         deviation = scale / np.sqrt(fan)
 
         def within_bounds(c: Comparisons, weights: np.ndarray) -> None:
-            c.holds("within the bounds", np.abs(weights) <= LARGEST * deviation * (1 + 4 * setting.u))
+            c.holds("within the bounds", np.abs(weights) <= largest * deviation * (1 + 4 * setting.u))
 
         expected = reference.truncated_normal(uniform, fan, scale)
         right = Equal(expected, magnitude=deviation, bound=1.14 * error)
@@ -381,14 +340,14 @@ def fans_are_those_of_whole_layers(setting: Setting) -> Cases:
     table = parameter_table(small_config(setting.profile, setting.dtype, **outscales), spaces())
     kernels = {name: entry for name, entry in table.items() if entry.initializer == "truncated_normal"}
     uniform = {name: np.full(entry.shape, 0.9) for name, entry in kernels.items()}
-    demands = []
+    demands, weight = [], quantiles()[4]
     for name, entry in table.items():
         axes = entry.shape
         if name.endswith("/kernel"):
             fan = {2: axes[0], 3: axes[0] * axes[1], 4: 25 * axes[-2]}[len(axes)]
             zero = name in ("reward/out/kernel", "critic/out/kernel")
             scale = 0.0 if zero else 0.01 if name.startswith("actor/out/") else 1.0
-            expected = np.full(axes, 1.3460640 * scale / np.sqrt(fan))
+            expected = np.full(axes, weight * scale / np.sqrt(fan))
             demands.append(Equal(expected, (name,), where=name, magnitude=1 / np.sqrt(fan), bound=2e-5))
         else:
             demands.append(exactly(np.full(axes, 1.0 if name.endswith("/scale") else 0.0), (name,), name))
@@ -399,8 +358,7 @@ def fans_are_those_of_whole_layers(setting: Setting) -> Cases:
 def pooling_literals(setting: Setting) -> Cases:
     """[[1, 2], [3, 4]] pools to 4 and [[1, 2]] grows to [[1, 1, 2, 2], [1, 1, 2, 2]]; a NaN anywhere in a window
     shows."""
-    yield exact("max_pool", (np.array([[[1.0], [2]], [[3], [4]]]),), np.array([[[4]]]))
-    yield exact("upsample", (np.array([[[1.0], [2]]]),), np.array([[1, 1, 2, 2], [1, 1, 2, 2]])[..., None])
+    yield from worked_cases(setting, "layers", "pooling", "upsampling")
     yield exact("max_pool", (np.full((2, 2, 1), -3.0),), np.full((1, 1, 1), -3.0), where="negative numbers")
     for row in range(2):
         for column in range(2):

@@ -21,6 +21,7 @@ from conformance.problems import (
     small_config,
     uniforms,
 )
+from conformance.worked import worked_cases
 from reference_numpy import agent as reference_agent
 from reference_numpy import behavior as reference_behavior
 from reference_numpy import networks as reference_networks
@@ -69,16 +70,8 @@ def policy_arguments(setting: Setting, task: Spaces, rows: int) -> dict[str, Any
 def the_flat_action_of_the_chapter(setting: Setting) -> Cases:
     """Buttons (1, 0) and turn (0.5, -2.0) are the flat action (0, 1, 1, 0, 0, 0.5, -2.0), sampled from two uniforms,
     then two normals."""
-    config = small_config(setting.profile, setting.dtype, actor_unimix=0.0)
-    lowest, highest = config.actor_min_std, config.actor_max_std
-    std = lowest + (highest - lowest) / (1 + np.exp(-2.0))
-    outputs = {
-        "turn": {"mean": np.zeros((1, 2)), "std": np.zeros((1, 2))},
-        "buttons": {"logits": setting.cast([[0, 1, 2, 1, 0]])},
-    }
-    noise = np.array([[0.5, 0.25, 0.5 / std, -2.0 / std]])
-    expected = np.array([[0, 1, 1, 0, 0, 0.5, -2]])
-    yield equal("sample_action", (outputs, noise, EXAMPLE, config), expected, magnitude=1.0, factor=4)
+    yield from worked_cases(setting, "notation", "a flat action", floor=1.0, bound=16 * setting.u)
+    yield from worked_cases(setting, "behavior", "an action of several keys", floor=1.0, bound=16 * setting.u)
 
 
 @check("CON-25", "CON-26", "NET-3", "BEH-8", uses=["sample_action", "encoder"], level=1)

@@ -1,7 +1,6 @@
 """Checks of spec/09-optimizer.md."""
 
 import dataclasses
-import math
 from typing import Any
 
 import hypothesis.strategies as st
@@ -12,6 +11,7 @@ from conformance.check import check
 from conformance.compare import WIDE, Comparisons
 from conformance.problems import random_state, small_config, spaces
 from conformance.strategies import normals, seeds, shapes
+from conformance.worked import worked_cases
 from reference_numpy import optimizer as reference
 from spec import Config
 
@@ -24,12 +24,9 @@ def config_of(setting: Setting, **overrides: Any) -> Config:
 def clip_literals(setting: Setting) -> Cases:
     """A gradient of norm 5 at a parameter of norm 2 is shortened to 0.6; one of norm 0.5 is left alone; the floor is
     epsilon."""
-    function, bound = "adaptive_gradient_clip", 16 * setting.u
-    parameter = np.array([[2.0, 0.0], [0.0, 0.0]])
-    long, short = np.array([[3.0, 0.0], [0.0, -4.0]]), setting.cast([[0.3, 0.0], [0.0, -0.4]])
-    yield equal(function, (long, parameter, 0.3, 1e-3), np.array([[0.36, 0], [0, -0.48]]), bound=bound)
-    yield exact(function, (short, parameter, 0.3, 1e-3), short, where="short gradient")
-    yield equal(function, (long, np.zeros((2, 2)), 0.3, 1e-3), np.array([[1.8e-4, 0], [0, -2.4e-4]]), bound=bound)
+    yield from worked_cases(setting, "optimizer", "clipping by hand", bound=16 * setting.u)
+    short, parameter = setting.cast([[0.3, 0.0], [0.0, -0.4]]), np.array([[2.0, 0.0], [0.0, 0.0]])
+    yield exact("adaptive_gradient_clip", (short, parameter, 0.3, 1e-3), short, where="short gradient")
 
 
 @check("OPT-1", "OPT-2", uses=["adaptive_gradient_clip"], level=0)
@@ -54,7 +51,7 @@ def clip_extremes(setting: Setting) -> Cases:
         for arguments in ((gradient, ones, 0.3, 1e-3), (ones, parameter, 0.3, 1e-3)):
             yield equal(function, arguments, reference.adaptive_gradient_clip(*arguments), bound=64 * setting.u)
     yield exact(function, (np.zeros(3), np.zeros(3), 0.3, 1e-3), np.zeros(3), where="zero")
-    yield exact(function, (np.array([0.0, 1.0]), ones, 0.0, 1e-3), np.zeros(2), where="clip 0")
+    yield from worked_cases(setting, "optimizer", "a clip of 0")
     for long, size in (([np.inf, 1.0], [1.0, 1.0]), ([np.nan, 1.0], [1.0, 1.0]), ([1.0, 1.0], [np.inf, 1.0])):
         arguments = (np.array(long), np.array(size), 0.3, 1e-3)
         yield exact(function, arguments, np.full(2, np.nan), where="non-finite")
@@ -64,29 +61,13 @@ def clip_extremes(setting: Setting) -> Cases:
 def learning_rate_literals(setting: Setting) -> Cases:
     """With a warmup of 1000 steps the rate is 0, 1/1000, 1/2 and 1 times the full rate after 0, 1, 500 and 1000
     updates."""
-    warm, constant = (config_of(setting, warmup_steps=steps, learning_rate=4e-5) for steps in (1000, 0))
-    for step, share in ((0, 0.0), (1, 0.001), (500, 0.5), (1000, 1.0), (5000, 1.0)):
-        yield equal("learning_rate", (step, warm), 4e-5 * share, bound=16 * setting.u)
-        yield equal("learning_rate", (step, constant), 4e-5, bound=16 * setting.u)
+    yield from worked_cases(setting, "optimizer", "learning rates", bound=16 * setting.u)
 
 
 @check("OPT-8", "OPT-12", "OPT-13", uses=["laprop"], level=0)
 def laprop_literals(setting: Setting) -> Cases:
     """The first update is the sign of the gradient, whatever its size; the second follows by hand."""
-    config, bound = config_of(setting, beta1=0.5, beta2=0.75), 16 * setting.u
-    gradient, zeros = np.array([4.0, -0.125, 0.0, 1024.0]), np.zeros(4)
-    yield judged(
-        "laprop",
-        (gradient, zeros, zeros, 0, config),
-        Equal(np.array([1.0, -1, 0, 1]), at=(0,), where="first update", magnitude=1.0, bound=bound),
-        Equal(gradient**2 / 4, at=(1,), where="second moment", bound=bound),
-        Equal(np.array([0.5, -0.5, 0, 0.5]), at=(2,), where="momentum", magnitude=1.0, bound=bound),
-    )
-    # g = 8 after g = 4: v = 0.75 * 4 + 0.25 * 64 = 19, debiased 19 / 0.4375; u = 8 / sqrt(43.43) = 1.2139;
-    # m = 0.25 + u / 2; update = m / 0.75.
-    later = (np.array([8.0]), np.array([4.0]), np.array([0.5]), 1, config)
-    expected = (0.25 + 0.5 * 8 / math.sqrt(19 / 0.4375)) / 0.75
-    yield equal("laprop", later, np.array([expected]), at=(0,), where="second update", bound=bound)
+    yield from worked_cases(setting, "optimizer", "exact updates", bound=16 * setting.u)
 
 
 @check("OPT-8", "OPT-11", "OPT-12", uses=["laprop"], level=0)

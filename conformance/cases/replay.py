@@ -14,6 +14,7 @@ from conformance.check import script
 from conformance.ledger import LATENTS, Arrays, Ledger, record
 from conformance.script import Script
 from conformance.strategies import seeds
+from conformance.worked import worked
 
 TYPES = {
     "x": "float32",
@@ -115,6 +116,17 @@ def histories_match_the_definition(script: Script) -> None:
                 script.exact("len after loading", len(replay), len(ledger.items))
 
 
+def by_hand(script: Script, name: str) -> Any:
+    """Makes the calls of a worked example, and returns its buffer."""
+    (example,) = worked("replay", name)
+    replay = script.call("Replay", *example.arguments)
+    for call in example.calls:
+        result = getattr(replay, call.function)(*call.arguments)
+        if call.expected is not None:
+            script.compare(f"Replay, {call.name}", result, call.expected, magnitude=1.0, bound=0.0)
+    return replay
+
+
 BY_HAND = ("REP-2", "REP-4", "REP-5", "REP-7", "REP-8", "REP-12", "REP-14", "REP-15", "REP-18", "REP-20", "REP-22")
 
 
@@ -122,18 +134,7 @@ BY_HAND = ("REP-2", "REP-4", "REP-5", "REP-7", "REP-8", "REP-12", "REP-14", "REP
 def a_small_buffer_by_hand(script: Script) -> None:
     """T = 2, capacity 3, records 0 to 5: row 0 comes from the queue, row 1 is drawn, and record 3 keeps the latents of
     row 1."""
-    replay = filled(script, 6, capacity=3)
-    script.exact("len", len(replay), 3)
-    batch = replay.sample([0.0, 0.5])
-    script.exact("ids", batch["ids"], [[0, 1], [0, 2]])
-    script.exact("x", batch["x"][..., 0], [[2, 3], [3, 4]])
-    script.exact("prev_action", batch["prev_action"][..., 0], [[10, 20], [20, 30]])
-    script.exact("deter", batch["deter"][:, :2], [[1, 1001], [2, 1002]])
-    script.exact("stoch", batch["stoch"], [[1, 2], [2, 3]])
-    fresh = latents(2, 2, 5.0)
-    fresh["deter"][1] = 6.0
-    replay.write_back(batch["ids"], fresh)
-    script.exact("latents of records 1, 2 and 3", contexts(replay, [0.0, 0.4, 0.9]), [1, 5, 6])
+    by_hand(script, "a small buffer")
 
 
 @script("REP-14", "REP-19", uses=["Replay"], level=0)
@@ -202,18 +203,9 @@ def uniform_numbers_choose_items(script: Script) -> None:
 def flags_inside_a_sequence(script: Script) -> None:
     """An abandoned episode ends where the next one begins, except at the last position; nothing else is changed or
     masked."""
-    firsts, lasts = [False, False, True, False, True], [False, False, False, True, False]
-    replay = script.call("Replay", 10, 3)
-    for n in range(5):
-        replay.add(
-            record(n, is_first=np.array(firsts[n]), is_last=np.array(lasts[n]), is_terminal=np.array(lasts[n])), 0
-        )
-    batch = replay.sample([0.0, 0.9], online=False)
-    script.exact("is_first", batch["is_first"], [[False, True, False], [True, False, True]])
-    script.exact("is_last", batch["is_last"], [[True, False, True], [False, True, False]])
-    script.exact("is_terminal", batch["is_terminal"], [[False, False, True], [False, True, False]])
-    script.exact("prev_action", batch["prev_action"][..., 0], [[0, 10, 20], [10, 20, 30]])
-    script.exact("stored is_last", replay.state_dict()["records/is_last"], lasts)
+    by_hand(script, "an abandoned episode")
+    replay = by_hand(script, "ends inside a sequence")
+    script.exact("stored is_last", replay.state_dict()["records/is_last"], [False, False, False, True, False])
 
 
 @script("REP-6", "REP-23", uses=["Replay"], level=0)

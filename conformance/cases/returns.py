@@ -10,6 +10,7 @@ from conformance.check import check
 from conformance.compare import Comparisons
 from conformance.problems import small_config
 from conformance.strategies import seeds
+from conformance.worked import worked_cases
 from reference_numpy import returns as reference
 
 GAMMA = 1 - 1 / 333
@@ -36,11 +37,10 @@ def replayed(setting: Setting, seed: int, length: int) -> tuple[np.ndarray, np.n
 def lambda_return_literals(setting: Setting) -> Cases:
     """With gamma = lambda = 1/2, rewards 9,1,0,2, continues 1,1,.5,1 and values 7,4,2,10 the returns are 2.28125,
     1.125, 7."""
-    reward, continue_, value = np.array([[9.0, 1, 0, 2]]), np.array([[1, 1, 0.5, 1]]), np.array([[7.0, 4, 2, 10]])
-    yield exact("lambda_return", (reward, continue_, value, 0.5, 0.5), np.array([[2.28125, 1.125, 7.0]]))
-    reward, value = np.array([[0.0, 0, 0, 1, 0]]), np.array([[2.0, 2, 2, 1, 1]])
-    expected = np.array([[1.9831, 1.9885, 1.9942, 0.9970]])
-    yield equal("lambda_return", (reward, np.ones((1, 5)), value, GAMMA, 0.95), expected, bound=5e-5)
+    yield from worked_cases(setting, "returns", "a return by hand", "the ends of lambda")
+    yield from worked_cases(setting, "returns", "arriving at a terminal state", "a single transition")
+    constants = ("a return with the real constants", "the discount enters once")
+    yield from worked_cases(setting, "returns", *constants, bound=64 * setting.u)
 
 
 @check("RET-1", uses=["lambda_return"], level=0)
@@ -75,14 +75,8 @@ def lambda_return_ignores_the_start(setting: Setting) -> Cases:
 def weights_literals(setting: Setting) -> Cases:
     """Weights are 1, gamma, gamma^2, ... without ends; a certain end silences all that follows; the last continue is
     not used."""
-    expected = np.array([[1, GAMMA, GAMMA**2]])
-    yield equal("cumulative_weights", (np.ones((1, 4)), GAMMA), expected, bound=16 * setting.u)
-    continue_ = np.array([[1, 1, 0, 1, 1], [0, 1, 1, 1, 1], [0.5, 0.5, 1, 1, 0]])
-    expected = np.array([[1, 0.5, 0, 0], [0, 0, 0, 0], [0.5, 0.125, 0.0625, 0.03125]])
-    yield exact("cumulative_weights", (continue_, 0.5), expected)
-    half = np.array([[0.5, 0.25]])
-    yield exact("cumulative_weights", (np.array([[0.5, 1, np.nan]]), 0.5), half, where="the last continue is NaN")
-    yield exact("cumulative_weights", (np.array([[0.5, 0.5, 1]]), 1.0), half, where="a discount of 1")
+    yield from worked_cases(setting, "returns", "weights of sixteen living states", bound=16 * setting.u)
+    yield from worked_cases(setting, "returns", "weights by hand")
 
 
 @check("RET-7", uses=["cumulative_weights"], level=0)
@@ -107,13 +101,9 @@ def weights_refuse_discounts(setting: Setting) -> Cases:
 @check("RET-9", uses=["replay_lambda_return"], level=0)
 def replay_return_literals(setting: Setting) -> Cases:
     """A chain without an end, one that is cut off and one that is terminal at step 2, by hand."""
-    reward, annotation = np.array([[0.0, 1, 2, 0, 3]] * 3), np.array([[8.0, 4, 6, 10, 2]] * 3)
-    is_last = np.zeros((3, 5), bool)
-    is_terminal = np.zeros((3, 5), bool)
-    is_last[1:, 2] = is_terminal[2, 2] = True
-    expected = np.array([[3.09375, 4.375, 3.5, 4], [3.25, 5, 3.5, 4], [2.5, 2, 3.5, 4]])
-    yield exact("replay_lambda_return", (reward, is_last, is_terminal, annotation, 0.5, 0.5), expected)
-    one = (array[:, :1] for array in (reward, is_last, is_terminal, annotation))
+    yield from worked_cases(setting, "returns", "replayed returns by hand")
+    yield from worked_cases(setting, "returns", "replayed returns with the real constants", bound=64 * setting.u)
+    one = replayed(setting, setting.seed, 1)
     yield exact("replay_lambda_return", (*one, 0.5, 0.5), np.zeros((3, 0)), where="one step has no return")
 
 
@@ -154,10 +144,8 @@ def replay_return_does_not_cross_ends(setting: Setting) -> Cases:
 @check("RET-12", uses=["percentile"], level=0)
 def percentile_literals(setting: Setting) -> Cases:
     """The 5th and 95th percentile of 16, 1, 4, 2, 8 are 1.2 and 14.4; 0 and 100 are the smallest and the largest."""
-    values = np.array([16.0, 1, 4, 2, 8])
-    for q, expected in ((5.0, 1.2), (95.0, 14.4), (0.0, 1.0), (100.0, 16.0), (50.0, 4.0)):
-        yield equal("percentile", (values, q), expected, bound=16 * setting.u)
-    yield exact("percentile", (np.array([[3.0]]), 5.0), 3.0, where="one value")
+    yield from worked_cases(setting, "returns", "percentiles of five values", bound=16 * setting.u)
+    yield from worked_cases(setting, "returns", "the percentile of one value")
 
 
 @check("RET-12", uses=["percentile"], level=0)
@@ -184,11 +172,7 @@ def percentile_refuses(setting: Setting) -> Cases:
 @check("RET-14", "RET-15", uses=["update_return_range"], level=0)
 def return_range_literals(setting: Setting) -> Cases:
     """From zero, the first update moves low and high by one hundredth of the percentiles, without debiasing."""
-    config = small_config(setting.profile)
-    returns = np.array([[16.0, 1, 4, 2, 8]])
-    for low, high in ((0.0, 0.0), (-1.0, 3.0)):
-        expected = (0.99 * low + 0.012, 0.99 * high + 0.144)
-        yield equal("update_return_range", (low, high, returns, config), expected, bound=64 * setting.u)
+    yield from worked_cases(setting, "returns", "the range after one update", bound=64 * setting.u)
 
 
 @check("RET-14", uses=["update_return_range"], level=0)
@@ -205,9 +189,7 @@ def return_range_matches(setting: Setting) -> Cases:
 @check("RET-16", uses=["return_scale"], level=0)
 def return_scale_literals(setting: Setting) -> Cases:
     """The scale is high - low, but never below the limit; NaN shows."""
-    for low, high, limit, expected in ((0.0, 0.5, 1.0, 1.0), (-2.0, 3.0, 1.0, 5.0), (3.0, -2.0, 1.0, 1.0)):
-        yield exact("return_scale", (low, high, limit), expected)
-    yield exact("return_scale", (0.0, 0.5, 0.25), 0.5)
+    yield from worked_cases(setting, "returns", "the scale of returns")
     yield exact("return_scale", (np.nan, 1.0, 1.0), np.nan, where="NaN")
 
 

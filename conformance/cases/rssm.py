@@ -8,9 +8,10 @@ import numpy as np
 
 from conformance.case import Cases, Drawn, Equal, Setting, equal, exact, exactly, judged, refused, related
 from conformance.check import check
-from conformance.compare import Comparisons, round_to
+from conformance.compare import BOUND, Comparisons, round_to
 from conformance.problems import random_actions, random_carry, random_parameters, small_config, spaces
 from conformance.strategies import normals, seeds
+from conformance.worked import worked_cases
 from reference_numpy import rssm as reference
 from reference_numpy.distributions import unimix_log_probs
 from spec import Config, Spaces, parameter_table
@@ -96,23 +97,14 @@ def reference_imagine(
 def gates_literals(setting: Setting) -> Cases:
     """Memories 0.2, -0.5 and 1 with gate inputs (0, 1, 1), (1, 2, 0) and (0, 0, 0) become 0.331059, -0.124003 and
     0.731059."""
-    config = small_config(setting.profile, setting.dtype, deter=3, blocks=1)
-    params = zero_parameters(config) | {"rssm/gru/bias": np.array([0.0, 1, 0, 1, 2, 0, 1, 0, 0])}
-    deter = setting.cast([[0.2, -0.5, 1.0]])
-    inputs = deter, np.zeros((1, config.stoch, config.classes)), np.zeros((1, TASK.action_size))
-    expected = np.array([[0.331059, -0.124003, 0.731059]])
-    bound = 2e-2 if setting.dtype == "bfloat16" else 2e-6
-    yield equal("core", (params, *inputs, config), expected, magnitude=1.0, bound=bound)
+    bound = {"float64": 1e-12, "float32": 2e-6, "bfloat16": 2e-2}[setting.dtype]
+    yield from worked_cases(setting, "rssm", "the gates", floor=1.0, bound=bound)
 
 
 @check("RSSM-6", uses=["core"], level=1)
 def gates_are_split_inside_each_block(setting: Setting) -> Cases:
     """With 4 memory units in 2 blocks, the gate outputs are r0 r1 c0 c1 u0 u1 r2 r3 c2 c3 u2 u3."""
-    config = small_config(setting.profile, setting.dtype, deter=4, blocks=2)
-    bias = np.array([100, 100, 0.25, 0.5, 100, 100, 100, 100, 0.75, 1, 100, 100])
-    inputs = np.ones((1, 4)), np.zeros((1, config.stoch, config.classes)), np.zeros((1, TASK.action_size))
-    expected = np.tanh([[0.25, 0.5, 0.75, 1.0]])
-    yield equal("core", (zero_parameters(config) | {"rssm/gru/bias": bias}, *inputs, config), expected)
+    yield from worked_cases(setting, "rssm", "the layout of the gates", bound=BOUND[setting.dtype])
 
 
 @check("RSSM-3", "RSSM-4", "RSSM-5", uses=["core"], level=1)

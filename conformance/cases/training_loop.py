@@ -15,6 +15,7 @@ from conformance.compare import Comparisons
 from conformance.problems import small_config
 from conformance.script import Script
 from conformance.strategies import seeds
+from conformance.worked import worked, worked_cases
 from spec import Discrete, Spaces, Vector, load_config
 
 TASK = Spaces({"x": Vector(1)}, {"turn": Vector(4), "buttons": Discrete((2, 3))})
@@ -23,18 +24,11 @@ TASK = Spaces({"x": Vector(1)}, {"turn": Vector(4), "buttons": Discrete((2, 3))}
 @script("LOOP-14", uses=["ReplayRatio"], level=0)
 def train_steps_by_hand(script: Script) -> None:
     """The worked numbers of the chapter: ratio 1.5 with batches of 4 steps, and the totals at the paper's sizes."""
-    ratio = script.call("ReplayRatio", 1.5, 4)
-    script.exact("steps 10 to 18", [ratio(step) for step in range(10, 19)], [1, 0, 0, 1, 0, 0, 1, 0, 1])
-    ratio = script.call("ReplayRatio", 128.0, 1024)
-    script.exact("one worker, ratio 128", [ratio(1088), ratio(100_000)], [1, 12_364])
-    ratio = script.call("ReplayRatio", 32.0, 1024)
-    script.exact("sixteen workers, ratio 32", [ratio(2048 + k) for k in range(65)], [1, *([0] * 31 + [1]) * 2])
-    ratio = script.call("ReplayRatio", 512.0, 1024)
-    script.exact("ratio 512", [ratio(step) for step in range(5, 11)], [1, 0, 1, 0, 1, 0])
-    ratio = script.call("ReplayRatio", 1024.0, 1024)
-    script.exact(
-        "steps may stand still and jump", [ratio(5), ratio(5), ratio(6), ratio(16), ratio(16)], [1, 0, 1, 10, 0]
-    )
+    names = ("no drift", "totals", "sixteen workers", "a high ratio", "steps that jump and stand still")
+    for case in worked("training_loop", *names):
+        ratio = script.call("ReplayRatio", *case.arguments)
+        steps = [ratio(*call.arguments) for call in case.calls]
+        script.exact(f"ReplayRatio, {case.name}", steps, [call.expected for call in case.calls])
 
 
 @script("LOOP-14", "LOOP-15", uses=["ReplayRatio"], level=0)
@@ -141,36 +135,26 @@ def training_starts_with_enough_items(setting: Setting) -> Cases:
 def environment_actions_by_hand(setting: Setting) -> Cases:
     """Indices of choices, numbers clipped and scaled to the bounds, to a range 2 wide at a single one, as they are
     where there is none."""
-    low, high = {"turn": np.array([0, -np.inf, 0, -2])}, {"turn": np.array([10, np.inf, np.inf, 2])}
-    flat = np.array([0, 1, 0, 0, 1, 0.5, -1.7, -0.25, 1.7])  # keys in sorted order: buttons, turn
-    buttons, turn = exactly([1, 2], ("buttons",), "buttons"), exactly([7.5, -1, 0.75, 2], ("turn",), "turn")
+    (example,) = worked("training_loop", "actions of an environment")
+    flat, _, low, high = example.arguments
 
     def has_the_keys(c: Comparisons, result: Any) -> None:
         c.holds("exactly the keys of the task", set(result) == set(TASK.actions))
         dtype = result["buttons"].dtype
         c.holds(f"indices are int64, got {dtype}", dtype == np.int64)
 
-    yield judged("environment_action", (flat, TASK, low, high), buttons, turn, has_the_keys)
+    yield judged("environment_action", example.arguments, exactly(example.expected), has_the_keys)
+    yield from worked_cases(setting, "training_loop", "one dimension", bound=4 * setting.u)
     ties = np.array([0.5, 0.5, 0.1, 0.3, 0.3, 0, 0.3, 5, 0])
     where = "the first of equals"
     yield exact("environment_action", (ties, TASK, low, high), [0, 1], at=("buttons",), where=where)
     one = Spaces({"x": Vector(1)}, {"a": Vector(1)})
-    for number, bottom, top, expected in (
-        (1.0, 0.1, 0.3, 0.3),
-        (-1.0, 0.1, 0.3, 0.1),
-        (1.7, 0, 10, 10),
-        (1.7, -np.inf, np.inf, 1),
-        (1e-20, -np.inf, np.inf, 1e-20),
-        (0.5, -np.inf, 0.25, -0.25),
-        (0.5, -0.25, np.inf, 1.25),
-        (-1.7, -np.inf, 0.25, -1.75),
-        (1.7, -0.25, np.inf, 1.75),
-    ):
+    for number, bottom, top, expected in ((-1.0, 0.1, 0.3, 0.1), (-1.7, -np.inf, 0.25, -1.75)):
         arguments = (np.array([number]), one, {"a": np.array([bottom])}, {"a": np.array([top])})
         yield equal("environment_action", arguments, {"a": np.array([expected])}, bound=4 * setting.u)
 
     def last_turn(c: Comparisons, result: Any) -> None:
-        c.exact("turn of a batch", result["turn"][1, 2], [7.5, -1, 0.75, 2])
+        c.exact("turn of a batch", result["turn"][1, 2], example.expected["turn"])
 
     batch = np.stack([[flat, ties, flat], [ties, flat, flat]])
     indices = [[[1, 2], [0, 1], [1, 2]], [[0, 1], [1, 2], [1, 2]]]
@@ -217,18 +201,11 @@ def broken_actions_are_refused(setting: Setting) -> Cases:
 @check("LOOP-7", "LOOP-10", "CON-11", uses=["step_flags"], level=0)
 def flags_by_hand(setting: Setting) -> Cases:
     """A reset is first and nothing else; an end is last by either reason, and terminal by termination alone."""
-    for reset, terminated, truncated, first, last, terminal in (
-        (True, False, False, True, False, False),
-        (True, True, True, True, False, False),
-        (False, False, False, False, False, False),
-        (False, True, False, False, True, True),
-        (False, False, True, False, True, False),
-        (False, True, True, False, True, True),
-    ):
-        expected = {"is_first": np.array(first), "is_last": np.array(last), "is_terminal": np.array(terminal)}
+    examples = [(case.arguments, case.expected) for case in worked("training_loop", "flags of a step")]
+    a_reset = examples[0][1]
+    for arguments, expected in (*examples, ((True, True, True), a_reset)):
         for kind in (bool, np.bool_):
-            arguments = (kind(reset), kind(terminated), kind(truncated))
-            yield equal("step_flags", arguments, expected, bound=1e-9)
+            yield exact("step_flags", tuple(map(kind, arguments)), expected)
 
 
 RECORD = ("LOOP-3", "LOOP-9", "LOOP-10", "CON-9", "CON-10", "CON-27", "REP-6", "REP-19")
@@ -270,12 +247,7 @@ def records_by_hand(script: Script) -> None:
 @check("LOOP-24", "LOOP-25", uses=["derive_seed"], level=0)
 def seeds_by_hand(setting: Setting) -> Cases:
     """The seeds of the chapter, and those that SHA-256 gives for any other seed, purpose and index."""
-    for arguments, expected in (
-        ((0, "parameters", 0), 589476934),
-        ((0, "environment", 1), 783237557),
-        ((7, "train", 1000), 1045752270),
-    ):
-        yield exact("derive_seed", arguments, expected, where=f"derive_seed{arguments}")
+    yield from worked_cases(setting, "training_loop", "seeds")
 
     def case(seed: int, purpose: str, index: int) -> Cases:
         first = hashlib.sha256(f"{seed}/{purpose}/{index}".encode()).digest()[:4]

@@ -23,6 +23,7 @@ from conformance.problems import (
     uniforms,
 )
 from conformance.strategies import adversarial_numbers, arrays, normals, seeds
+from conformance.worked import worked_cases
 from reference_numpy import agent
 from reference_numpy import world_model as reference
 from reference_numpy.distributions import unimix_log_probs
@@ -48,48 +49,37 @@ def held(setting: Setting, x: Any) -> np.ndarray:
 @check("WM-7", "CON-11", uses=["continue_target"], level=0)
 def continue_target_literals(setting: Setting) -> Cases:
     """0 at terminations; elsewhere 1, or 332/333 for the discounted target; any shape."""
-    is_terminal = np.array([[False, True, False], [True, False, False]])
-    hard, soft = (small_config(setting.profile, setting.dtype, continue_target=kind) for kind in ("hard", "discounted"))
-    target = np.array([[1.0, 0, 1], [0, 1, 1]])
-    yield exact("continue_target", (is_terminal, hard), target, where="hard")
-    yield equal("continue_target", (is_terminal, soft), target * (332 / 333), bound=4 * setting.u)
-    other = dataclasses.replace(soft, discount_horizon=4.0)
-    yield exact("continue_target", (is_terminal[0], other), np.array([0.75, 0, 0.75]), where="discount 3/4")
+    yield from worked_cases(setting, "world_model", "the continue target", bound=4 * setting.u)
+    is_terminal = np.array([False, True, False])
+    for kind, target in (("hard", 1.0), ("discounted", 0.75)):
+        config = small_config(setting.profile, setting.dtype, continue_target=kind, discount_horizon=4.0)
+        yield exact("continue_target", (is_terminal, config), target * ~is_terminal)
 
 
 @check("WM-10", "WM-11", "WM-14", "RSSM-10", uses=["kl_losses"], level=0)
 def kl_literals(setting: Setting) -> Cases:
     """2, 7, 8 and 10 latents of 0.128082 nats give 1, 1, 1.024657 and 1.280821: sum, then clip, for each row by
     itself."""
+    bound = bound_of(setting, 1e-12, 64 * setting.u)
+    yield from worked_cases(setting, "world_model", "KL of two classes", bound=bound)
     config = small_config(setting.profile, setting.dtype, stoch=10, classes=2, latent_unimix=0.01, free_nats=1.0)
-    sure, zeros = np.zeros((5, 10, 2)), np.zeros((5, 10, 2))
-    for row, latents in enumerate((2, 7, 8, 10, 10)):
-        sure[row, :latents, 1] = SURE
-    sure = held(setting, sure)
-    posterior, prior = np.concatenate([sure[:4], zeros[:1]]), np.concatenate([zeros[:4], sure[4:]])
-    expected = np.array([1, 1, 1.024657082, 1.280821352, 1.40535321])  # in the last row the prior is the sure one
-    bound = 1e-8 if setting.dtype == "float64" else 64 * setting.u
-    yield equal("kl_losses", (posterior, prior, config), (expected, expected), bound=bound)
-    lower = dataclasses.replace(config, free_nats=0.3)
-    expected = np.array([0.3, 0.896574946, 1.024657082, 1.280821352, 1.40535321])
-    yield equal("kl_losses", (posterior, prior, lower), (expected, expected), bound=bound)
+    posterior, zeros = np.zeros((3, 10, 2)), np.zeros((3, 10, 2))
+    for row, latents in enumerate((2, 8, 10)):
+        posterior[row, :latents, 1] = held(setting, SURE)
+    expected, where = reference.kl_losses(posterior, zeros, config), "kl_losses of several rows"
+    yield equal("kl_losses", (posterior, zeros, config), expected, where=where, bound=bound)
 
 
 @check("WM-10", "RSSM-10", uses=["kl_losses"], level=0)
 def kl_is_bounded(setting: Setting) -> Cases:
     """32 latents of 64 classes that are sure of different classes are 277.331813 nats apart: the mixture is in both
     distributions."""
-    config = small_config(setting.profile, setting.dtype, stoch=32, classes=64, latent_unimix=0.01)
-    first, last = np.full((1, 32, 64), -1e4), np.full((1, 32, 64), -1e4)
-    first[..., 0] = last[..., -1] = 1e4
-    expected = np.array([277.331813])
-    bound = 1e-8 if setting.dtype == "float64" else 64 * setting.u
-    yield equal("kl_losses", (first, last, config), (expected, expected), bound=bound)
-    half = np.zeros((1, 32, 64))
+    bound, half = bound_of(setting, 1e-12, 64 * setting.u), np.zeros((1, 32, 64))
+    yield from worked_cases(setting, "world_model", "the largest KL of a state", bound=bound)
     # Without mixture the probabilities are 1/2 and 63 times 1/126, here compared with 64 times 1/64.
     half[..., 0] = math.log(63)
     expected = np.array([32 * (math.log(64 / 2) + math.log(64 / 126)) / 2])
-    plain = dataclasses.replace(config, latent_unimix=0.0)
+    plain = small_config(setting.profile, setting.dtype, stoch=32, classes=64, latent_unimix=0.0)
     yield equal("kl_losses", (held(setting, half), np.zeros((1, 32, 64)), plain), (expected, expected), bound=bound)
 
 
@@ -141,20 +131,8 @@ def kl_extremes(setting: Setting) -> Cases:
 def reconstruction_literals(setting: Setting) -> Cases:
     """Vector 10 at 1 costs 1.954111 times the scale; Discrete((2, 3)) at (0, 2) ln 4 + ln 3, whatever the scale; a
     pixel 0.25."""
-    task = Spaces({"x": Vector(2), "kind": Discrete((2, 3)), "view": Image(2, 2, 1)}, ACTIONS)
-    kind = held(setting, [[0.0, SURE, 0.0, 0.0, 0.0]])
-    predictions = {"x": np.array([[1.0, 0.0]]), "kind": kind, "view": np.full((1, 2, 2, 1), 0.5)}
-    view = np.array([[255, 0], [0, 51]], np.uint8).reshape(1, 2, 2, 1)
-    observations = {"x": np.array([[10, 0]], np.float32), "kind": np.array([[0, 2]]), "view": view}
-    for scale in (0.5, 1.0):
-        config = small_config(setting.profile, setting.dtype, vector_loss_scale=scale)
-        expected = {
-            "x": np.array([1.954111 * scale]),
-            "kind": np.array([2.4849066498]),
-            "view": np.array([0.75 + 0.09]),
-        }
-        arguments = predictions, observations, task, config
-        yield equal("reconstruction_losses", arguments, expected, bound=1e-6 + 16 * setting.u)
+    losses = ("the loss of a Vector", "the loss of a Discrete", "the loss of an Image")
+    yield from worked_cases(setting, "world_model", *losses, bound=16 * setting.u)
 
 
 @check("WM-2", "WM-3", "WM-4", "WM-5", "WM-18", "CON-24", uses=["reconstruction_losses"], level=0)
