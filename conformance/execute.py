@@ -195,11 +195,11 @@ def run_checks(adapter: object, setting: Setting, only: str = "") -> Iterable[Re
 
 
 def calls_of(checks: Iterable[Check], adapter: object, setting: Setting) -> Iterator[tuple[str, tuple[Any, ...]]]:
-    """The calls of all cases, which a candidate that compiles may want to know in advance."""
+    """The calls of all cases that are not refused, which a candidate that compiles may want to know in advance."""
     for check in checks:
         if check.cases is not None and not missing(adapter, check):
             for case, _ in cases(check.cases, setting):
-                yield from ((call.function, call.arguments) for call in case.calls)
+                yield from ((call.function, call.arguments) for call in case.calls if case.refused is None)
 
 
 def rows(results: Iterable[Result]) -> list[Row]:

@@ -22,6 +22,8 @@ ROWS = (transforms, distributions, layers, rssm, networks, world_model, returns,
 EXACT = ("truncated_normal", "dense", "mlp")
 # Run operation by operation: their Python floats would each need a compilation.
 EAGER_ROWS = (transforms, distributions)
+# Whole passes, each of which compiles for seconds.
+LARGE = ("gradients", "initial_parameters", "loss_derivatives", "losses", "open_loop", "optimizer_step", "train_step")
 QUICK = {"xla_backend_optimization_level": 0}
 
 
@@ -52,7 +54,7 @@ class JaxAdapter:
         """Compiles what these calls need, several at a time, and everything without the optimizations that take longer
         than small calls themselves. What a call raises is raised when it is made."""
         self.compiler_options = QUICK
-        distinct = {_signature(call): call for call in calls}.values()
+        distinct = {_signature(call): call for call in calls if call[0] in LARGE}.values()
 
         def make(call: tuple[str, tuple[Any, ...]]) -> None:
             with contextlib.suppress(Exception):

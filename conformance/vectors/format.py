@@ -18,7 +18,7 @@ import numpy as np
 from conformance.process import describe
 from spec import Config, Discrete, Image, Parameter, Spaces, Vector
 
-FORMAT = 1
+FORMAT = 2
 DTYPES = ("bool", "uint8", "int32", "int64", "float32", "float64")
 KINDS = {kind.__name__.lower(): kind for kind in (Config, Discrete, Image, Parameter, Spaces, Vector)}
 EPOCH = (1980, 1, 1, 0, 0, 0)
