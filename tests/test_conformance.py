@@ -3,6 +3,8 @@
 What CI runs is float64 for both backends, and for PyTorch both profiles and float32; the rest is marked slow.
 """
 
+import functools
+
 import pytest
 
 from conformance.adapter import load_adapter
@@ -38,9 +40,18 @@ CASES = [
 ]
 
 
+@functools.cache
+def adapter_of(backend: str, dtype: str) -> object:
+    """One for all checks, so that what they share is compiled once."""
+    adapter = load_adapter(backend, dtype)
+    if compile_calls := getattr(adapter, "compile_calls", None):
+        compile_calls(())
+    return adapter
+
+
 @pytest.mark.parametrize(("backend", "dtype", "profile", "check"), CASES)
 def test_the_backend_passes(backend: str, dtype: str, profile: str, check: Check) -> None:
-    result = run_check(check, load_adapter(backend, dtype), Setting(dtype, profile, examples=5))
+    result = run_check(check, adapter_of(backend, dtype), Setting(dtype, profile, examples=5))
     assert result.status in ("pass", "not offered"), result.message
 
 

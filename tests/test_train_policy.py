@@ -249,9 +249,9 @@ WRONG = [
     ({"position": np.zeros(3)}, r"observation 'position': expected shape \[4, 3\], got \[3\]"),
     ({"position": np.full((4, 3), np.nan)}, "observation 'position' holds nan; expected finite numbers"),
     ({"position": np.full((4, 3), 1e39)}, "observation 'position' holds inf; expected finite numbers"),
-    ({"mode": np.zeros((4, 2))}, "observation 'mode': a Discrete needs an integer dtype, got float64"),
-    ({"mode": np.full((4, 2), 2)}, r"observation 'mode', entry 1: expected values in 0 .. 1, got 2"),
-    ({"image": np.zeros((4, 16, 16, 3))}, "observation 'image': an Image needs the dtype uint8, got float64"),
+    ({"mode": np.zeros((4, 2))}, r"observations\['mode'\]: expected an integer dtype, got float64"),
+    ({"mode": np.full((4, 2), 2)}, r"observations\['mode'\], entry 1: expected values in 0 .. 1, got 2"),
+    ({"image": np.zeros((4, 16, 16, 3))}, r"observations\['image'\]: expected dtype uint8, got float64"),
     (
         {"image": np.zeros((4, 16, 32, 3), np.uint8)},
         r"observation 'image': expected shape \[4, 16, 16, 3\], got \[4, 16, 32, 3\]",

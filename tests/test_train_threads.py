@@ -175,7 +175,7 @@ class Watching:
             import os
             print(os.environ.get("OPENBLAS_NUM_THREADS"))
 sys.meta_path.insert(0, Watching())
-import dreamer_spec.cli, dreamer_spec.system.threads
+import dreamer_spec.cli, numpy, dreamer_spec.system.threads
 print(dreamer_spec.system.threads.usable_cores())
 """
     environment = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"} | given
