@@ -189,11 +189,6 @@ def selected_checks(dtype: str, only: str = "") -> list[Check]:
     ]
 
 
-def run_checks(adapter: object, setting: Setting, only: str = "") -> Iterable[Result]:
-    for check in selected_checks(setting.dtype, only):
-        yield run_check(check, adapter, setting)
-
-
 def calls_of(checks: Iterable[Check], adapter: object, setting: Setting) -> Iterator[tuple[str, tuple[Any, ...]]]:
     """The calls of all cases that are not refused, which a candidate that compiles may want to know in advance."""
     for check in checks:
