@@ -56,5 +56,5 @@ def normals(seed: int, *shape: int, scale: float = 1.0) -> np.ndarray:
     return np.random.default_rng(seed).normal(0.0, scale, shape)
 
 
-def shapes(max_rank: int = 3, max_side: int = 4) -> st.SearchStrategy[tuple[int, ...]]:
-    return st.lists(st.integers(1, max_side), min_size=0, max_size=max_rank).map(tuple)
+SHAPES = ((), (1,), (4,), (2, 3), (3, 1, 2))
+"""Of elementwise functions: few, since a candidate that compiles does so for each."""

@@ -20,8 +20,11 @@ from dreamer_spec.disk import checkpoint
 from dreamer_spec.replay import Replay
 
 ROOT = Path(__file__).parent.parent
-STEPS = 900
-SMALL = {"deter": 16, "units": 8, "stoch": 4, "classes": 4, "bins": 15, "envs": 2, "batch_size": 2, "batch_length": 8}
+STEPS = 500
+SMALL = {
+    **{"deter": 16, "units": 8, "stoch": 4, "classes": 4, "bins": 15, "envs": 2},
+    **{"batch_size": 2, "batch_length": 8, "imagination_horizon": 3},
+}
 OF_TIME = ("seconds", "speed/", "time/", "memory/")  # metrics that say how long something took
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGKILL")
@@ -29,44 +32,10 @@ pytestmark = pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGKILL"
 
 def command(backend: str, logdir: Path, *more: str) -> list[str]:
     sizes = [word for name, value in SMALL.items() for word in (f"--{name.replace('_', '-')}", str(value))]
-    run = [
-        "--task",
-        "gym:CartPole-v1",
-        "--steps",
-        str(STEPS),
-        "--seed",
-        "3",
-        "--logdir",
-        str(logdir),
-        "--no-preflight",
-        "--device",
-        "cpu",
-    ]
-    schedule = [
-        "--log-every",
-        "0",
-        "--eval-every",
-        "300",
-        "--eval-episodes",
-        "2",
-        "--random-episodes",
-        "2",
-        "--replay-ratio",
-        "8",
-    ]
-    return [
-        sys.executable,
-        "-m",
-        "dreamer_spec",
-        "--backend",
-        backend,
-        *run,
-        *schedule,
-        "--replay-capacity",
-        "300",
-        *sizes,
-        *more,
-    ]
+    run = f"--task gym:CartPole-v1 --steps {STEPS} --seed 3 --no-preflight --device cpu --replay-ratio 8"
+    schedule = "--log-every 0 --eval-every 300 --eval-episodes 2 --random-episodes 2 --replay-capacity 300"
+    python = [sys.executable, "-m", "dreamer_spec", "--backend", backend, "--logdir", str(logdir)]
+    return [*python, *run.split(), *schedule.split(), *sizes, *more]
 
 
 def start(call: list[str], output: Path) -> "subprocess.Popen[bytes]":
@@ -192,7 +161,7 @@ def test_a_signal_saves_and_leaves(tmp_path: Path) -> None:
         tmp_path / "output.txt",
         tmp_path / "run" / "metrics.jsonl",
     )
-    for number, size in ((signal.SIGTERM, 20_000), (signal.SIGINT, 200_000)):
+    for number, size in ((signal.SIGTERM, 20_000), (signal.SIGINT, 120_000)):
         process = start(call, output)
         while not log.exists() or log.stat().st_size < size:
             assert process.poll() is None, output.read_text()

@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import functools
+import gc
 import os
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -20,16 +21,12 @@ ROWS = (transforms, distributions, layers, rssm, networks, world_model, returns,
 # Functions of layers whose first array is not of the compute dtype; other rows take float32 or better and convert it
 # themselves.
 EXACT = ("truncated_normal", "dense", "mlp")
-# Run operation by operation: their Python floats would each need a compilation.
-EAGER_ROWS = (transforms, distributions)
-# Whole passes, each of which compiles for seconds.
-LARGE = ("gradients", "initial_parameters", "loss_derivatives", "losses", "open_loop", "optimizer_step", "train_step")
-QUICK = {"xla_backend_optimization_level": 0}
+# Small calls take less time than optimizing them. Options of XLA come and go with its versions.
+QUICK = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
 
 
 class JaxAdapter:
-    """Offers every public function of impl_jax under its name, NumPy in and NumPy out, compiled except for the
-    elementwise rows."""
+    """Offers every public function of impl_jax under its name, NumPy in and NumPy out, compiled."""
 
     def __init__(self, dtype: str, device: str | None) -> None:
         self.dtype = dtype
@@ -47,21 +44,28 @@ class JaxAdapter:
                 and getattr(function, "__module__", None) == row.__name__
             ):
                 first = jnp.bfloat16 if self.dtype == "bfloat16" and row is layers and name not in EXACT else None
-                return functools.partial(self._run, function, name, row not in EAGER_ROWS, first)
+                return functools.partial(self._run, function, name, first)
         raise AttributeError(name)
 
     def compile_calls(self, calls: Iterable[tuple[str, tuple[Any, ...]]]) -> None:
         """Compiles what these calls need, several at a time, and everything without the optimizations that take longer
         than small calls themselves. What a call raises is raised when it is made."""
-        self.compiler_options = QUICK
-        distinct = {_signature(call): call for call in calls if call[0] in LARGE}.values()
+        self.compiler_options = dict(filter(_is_accepted, QUICK.items()))
+        calls = (("gradients", inputs[:-1]) if name == "loss_derivatives" else (name, inputs) for name, inputs in calls)
+        distinct = {_signature(call): call for call in calls}
+        largest_first = sorted(distinct, key=lambda signature: len(str(signature)), reverse=True)
 
         def make(call: tuple[str, tuple[Any, ...]]) -> None:
             with contextlib.suppress(Exception):
                 getattr(self, call[0])(*call[1])
 
-        with ThreadPoolExecutor(os.cpu_count()) as threads:
-            list(threads.map(make, distinct))
+        gc.disable()  # tracing makes millions of objects, few of them garbage
+        try:
+            with ThreadPoolExecutor(os.cpu_count()) as threads:
+                list(threads.map(make, [distinct[signature] for signature in largest_first]))
+        finally:
+            gc.freeze()
+            gc.enable()
 
     def exponential_bins(self, bins: int) -> np.ndarray:
         return transforms.exponential_bins(bins)
@@ -74,19 +78,18 @@ class JaxAdapter:
 
     def _layers_of(self, key: str, function: Callable[..., Any], params: Any, x: Any, name: str, *rest: Any) -> Any:
         x = self._cast(x, jnp.bfloat16 if self.dtype == "bfloat16" else None)
-        return self._run(lambda params, x: function(params, name, x, *rest), (key, name, *rest), True, None, params, x)
+        return self._run(lambda params, x: function(params, name, x, *rest), (key, name, *rest), None, params, x)
 
     def imagine(self, params: Any, carry: Any, action: Any, uniform: Any, config: Config) -> Any:
         def function(params: Any, carry: Any, action: Any, uniform: Any, config: Config) -> Any:
             return rssm.imagine(params, carry, lambda feature, t: action[:, t], uniform, config)
 
-        return self._run(function, "imagine", True, None, params, carry, action, uniform, config)
+        return self._run(function, "imagine", None, params, carry, action, uniform, config)
 
     def laprop(self, gradient: Any, second_moment: Any, momentum: Any, step: int, config: Config) -> Any:
         return self._run(
             optimizer.laprop,
             "laprop",
-            True,
             None,
             gradient,
             second_moment,
@@ -95,37 +98,39 @@ class JaxAdapter:
             config,
         )
 
-    def gradients(self, params: Any, *rest: Any) -> Any:
-        def function(params: Any, *rest: Any) -> Any:
-            return jax.grad(agent.losses, has_aux=True)(params, *rest)[0]
-
-        return self._run(function, "gradients", True, None, params, *rest)
+    def gradients(self, *inputs: Any) -> Any:
+        return self._gradients(*inputs)["total"]
 
     def loss_derivatives(self, *arguments: Any) -> dict[str, np.ndarray]:
         *inputs, directions = arguments
-
-        def function(params: Any, *rest: Any) -> Any:
-            losses, pullback = jax.vjp(lambda params: agent.losses(params, *rest)[1]["losses"], params)
-            # One loss after the other: gradients [loss, ...] of every parameter.
-            rows = jnp.eye(len(losses), dtype=self.exact)
-            gradients = jax.lax.map(lambda row: pullback(dict(zip(losses, row, strict=True)))[0], rows)
-            return {name: {key: value[index] for key, value in gradients.items()} for index, name in enumerate(losses)}
-
-        gradients = self._run(function, "loss_derivatives", True, None, *inputs)
 
         def along(gradient: Any) -> np.ndarray:
             return np.array(
                 [sum(np.vdot(gradient[name], change) for name, change in direction.items()) for direction in directions]
             )
 
-        return {name: along(gradient) for name, gradient in gradients.items()}
+        return {name: along(gradient) for name, gradient in self._gradients(*inputs).items() if name != "total"}
+
+    def _gradients(self, *inputs: Any) -> Any:
+        """Gradients of the total and of every loss by every parameter, by one compiled function."""
+
+        def function(params: Any, *rest: Any) -> Any:
+            def outputs(params: Any) -> Any:
+                total, aux = agent.losses(params, *rest)
+                return {"total": total, **aux["losses"]}
+
+            values, pullback = jax.vjp(outputs, params)
+            rows = jnp.eye(len(values), dtype=self.exact)  # one output after the other: [output, ...] of each parameter
+            gradients = jax.lax.map(lambda row: pullback(dict(zip(values, row, strict=True)))[0], rows)
+            return {name: {key: value[index] for key, value in gradients.items()} for index, name in enumerate(values)}
+
+        return self._run(function, "gradients", None, *inputs)
 
     def initial_parameters(self, table: Any, uniforms: Any) -> Any:
-        return self._run(
-            lambda uniforms: agent.initial_parameters(table, uniforms), "initial_parameters", False, None, uniforms
-        )
+        key = ("initial_parameters", repr(table))
+        return self._run(lambda uniforms: agent.initial_parameters(table, uniforms), key, None, uniforms)
 
-    def _run(self, function: Callable[..., Any], key: Any, compile_: bool, first: Any, *arguments: Any) -> Any:
+    def _run(self, function: Callable[..., Any], key: Any, first: Any, *arguments: Any) -> Any:
         """Calls a function with configuration, spaces and plain numbers as they are, and arrays as traced arguments."""
         arguments = tuple(self._config(argument) for argument in arguments)
         is_static = [isinstance(argument, str | bool | int | float | Config | Spaces) for argument in arguments]
@@ -138,14 +143,13 @@ class JaxAdapter:
                 *(argument if static else next(values) for argument, static in zip(arguments, is_static, strict=True))
             )
 
-        if compile_:
-            statics = tuple(
-                repr(argument) if static else None for argument, static in zip(arguments, is_static, strict=True)
-            )
-            compiled = jax.jit(call, compiler_options=self.compiler_options)
-            call = self.compiled.setdefault((key, statics), compiled)
+        call.__name__ = key if isinstance(key, str) else key[0]  # for profilers
+        statics = tuple(
+            repr(argument) if static else None for argument, static in zip(arguments, is_static, strict=True)
+        )
+        compiled = self.compiled.setdefault((key, statics), jax.jit(call, compiler_options=self.compiler_options))
         with jax.default_device(self.device):
-            return _to_numpy(call(*dynamic))
+            return _to_numpy(compiled(*dynamic))
 
     def _config(self, argument: Any) -> Any:
         return dataclasses.replace(argument, compute_dtype=self.dtype) if isinstance(argument, Config) else argument
@@ -161,8 +165,19 @@ class JaxAdapter:
         array = np.asarray(x)
         if array.dtype.kind == "f":
             with np.errstate(over="ignore"):
-                return jnp.asarray(array.astype(self.exact)).astype(dtype or self.exact)
-        return jnp.asarray(array, np.int32 if array.dtype.kind == "i" else array.dtype)
+                array = array.astype(self.exact).astype(dtype or self.exact)
+        elif array.dtype.kind == "i":
+            array = array.astype(np.int32)
+        return jax.device_put(array, self.device)  # jnp.asarray would compile for each shape
+
+
+def _is_accepted(option: tuple[str, Any]) -> bool:
+    """Whether this version of XLA knows the option."""
+    try:
+        jax.jit(lambda: jnp.zeros(()), compiler_options=dict([option]))()
+    except jax.errors.JaxRuntimeError:
+        return False
+    return True
 
 
 def _signature(value: Any) -> Any:
