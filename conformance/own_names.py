@@ -18,14 +18,14 @@ def require_ours() -> None:
       ImportError: Python finds something else under one of our names.
     """
     for name in OURS:
-        if stranger := _stranger(name):
+        if found := _other_package(name):
             raise ImportError(
-                f"{stranger} hides the package {name} of dreamer-spec, because Python looks there first; rename it, or "
+                f"{found} hides the package {name} of dreamer-spec, because Python looks there first; rename it, or "
                 f"start from another folder"
             )
 
 
-def _stranger(name: str) -> Path | None:
+def _other_package(name: str) -> Path | None:
     """The file or folder that Python finds under that name and that is not ours."""
     found = None
     with contextlib.suppress(ValueError):  # A module that somebody has made in memory.

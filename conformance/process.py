@@ -1,8 +1,8 @@
-"""The process door: an implementation in a process of its own, asked by JSON lines over its standard input and output.
+"""The process interface: an implementation in a process of its own, asked by JSON lines over its standard input and output.
 
 Every request has one reply, and the next request is sent after it. Whatever the other side does, the kit gets a result:
-a process that dies, hangs, babbles or breaks the protocol is `CandidateLost`, which ends the check; the next check
-starts it anew. The messages are those of protocol.schema.json, docs/adapters.md explains them, serve.py is the other
+a process that dies, hangs, prints without end or breaks the protocol is `CandidateLost`, which ends the check; the next check
+restarts it. The messages are those of protocol.schema.json, docs/adapters.md explains them, serve.py is the other
 side for Python.
 """
 
@@ -27,7 +27,7 @@ from conformance.foreign import ForeignAdapter, as_edition
 from conformance.serve import PROTOCOL, BadMessage, decode, encode, to_numpy
 
 RESTARTS = 5
-BABBLE_LINES = 100
+UNEXPECTED_LINES = 100
 MESSAGE_BYTES = 2**26
 VALUES = 200_000  # numbers, texts, lists, maps and arrays in one result
 FUNCTIONS = 5000  # that a process may offer: a module with all of its imports has some hundreds
@@ -156,7 +156,7 @@ class Connection:
         with contextlib.suppress(OSError, ValueError), stdout:
             while (
                 self.partial <= MESSAGE_BYTES
-                and self._lines.qsize() <= BABBLE_LINES + 1
+                and self._lines.qsize() <= UNEXPECTED_LINES + 1
                 and (chunk := stdout.read(2**20))
             ):
                 *ends, rest = chunk.split(b"\n")
@@ -198,7 +198,7 @@ class ProcessAdapter(ForeignAdapter):
         self._starts = 0
         self._waited = 0.0
         self._connection: Connection | None = None
-        self._babble = 0
+        self._unexpected = 0
         try:
             started = self._start()
         except CandidateLost as error:
@@ -259,7 +259,7 @@ class ProcessAdapter(ForeignAdapter):
         if self._starts > RESTARTS:
             raise CandidateLost(f"the process is not started again: it was lost {self._starts} times")
         self._starts += 1
-        self._babble = 0
+        self._unexpected = 0
         try:
             self._connection = Connection(self._command)
         except (OSError, IndexError) as error:
@@ -309,7 +309,7 @@ class ProcessAdapter(ForeignAdapter):
         )
 
     def _reply(self, what: str, deadline: float) -> dict[str, Any]:
-        """The next line that is a message. Others are shown and left out, up to BABBLE_LINES of one process."""
+        """The next line that is a message. Others are shown and left out, up to UNEXPECTED_LINES of one process."""
         assert self._connection is not None
         while True:
             try:
@@ -327,11 +327,11 @@ class ProcessAdapter(ForeignAdapter):
                 message = None
             if isinstance(message, dict) and "id" in message:
                 return message
-            self._babble += 1
+            self._unexpected += 1
             text = line[:200].decode(errors="replace")
-            if self._babble > BABBLE_LINES:
+            if self._unexpected > UNEXPECTED_LINES:
                 raise self._lost(
-                    what, f"more than {BABBLE_LINES} lines on standard output are no messages, the last: {text!r}"
+                    what, f"more than {UNEXPECTED_LINES} lines on standard output are no messages, the last: {text!r}"
                 )
             print(f"{self._command[0]}: {text}", file=sys.stderr)
 

@@ -23,7 +23,7 @@ from typing import Any
 
 from conformance.commands.mutants import is_named
 from conformance.requirements import chapter_of, requirements
-from docs import backends, examples, strangers
+from docs import backends, examples, third_party
 from dreamer_spec.report import catalogue
 from spec import Edition, benchmarks, editions, hyperparameters, profiles, sizes
 
@@ -327,8 +327,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "replay_image": functools.partial(replay_table, "image"),
     "replay_small": functools.partial(replay_table, "small"),
     "metrics": catalogue.markdown,
-    "strangers": strangers.summary_table,
-    "stranger_findings": strangers.finding_sections,
+    "third_party": third_party.summary_table,
+    "third_party_findings": third_party.finding_sections,
     "loop_shares": loop_shares,
     "loop_memory": loop_memory,
     "lockstep_free": lambda: lockstep_table("free", ("float64",)),
@@ -344,7 +344,7 @@ KINDS: dict[str, Callable[[str], str]] = {
 
 
 def render(text: str) -> str:
-    """The text with every generated part made anew."""
+    """The text with every generated part made again."""
 
     def part(match: re.Match[str]) -> str:
         start, kind, argument, end = match.groups()

@@ -6,8 +6,8 @@ from dreamer_spec.system import before_numpy  # noqa: F401
 
 try:
     from dreamer_spec import own_packages  # noqa: F401
-except ImportError as stranger:
-    print(f"train: error: {stranger}", file=sys.stderr)
+except ImportError as error:
+    print(f"train: error: {error}", file=sys.stderr)
     sys.exit(2)
 
 # isort: split

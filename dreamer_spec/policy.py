@@ -67,11 +67,13 @@ class Policy:
             check_info(info, spaces)
             parameters = checked_parameters(sealed.arrays(PARAMETERS), acting_table(config, spaces))
         except (OSError, ValueError) as error:
-            raise UserError(f"cannot load the policy {path}: {error!s:.500}; `train export` writes it anew") from error
+            raise UserError(
+                f"cannot load the policy {path}: {error!s:.500}; write it again with `train export`"
+            ) from error
         return cls(SavedAgent(config, spaces, parameters, info, translation))
 
     def reset(self, n: int, seed: int = 0) -> None:
-        """Begins anew in `n` environments. seed: of the noise that the steps from here on draw."""
+        """Starts in `n` environments. seed: of the noise that the steps from here on draw."""
         self._carry = {
             "deter": np.zeros((n, self.config.deter)),
             "stoch": np.zeros((n, self.config.stoch, self.config.classes)),

@@ -23,7 +23,7 @@ class Learner:
     """One agent.
 
     All of its state lies in a few flat buffers that a train step changes in place (`parameters.py` says why): its
-    memory is taken once, and the mappings of names to tensors are views that never have to be made anew.
+    memory is taken once, and the mappings of names to tensors are views that are made once.
 
     seed: of the initial parameters. nonfinite: "stop" or "skip", [LOOP-40] to [LOOP-42]. threads: that compute on the
     CPU, in the whole process; None leaves them as they are.
@@ -134,7 +134,7 @@ class Learner:
         _, metrics, factors, aux = self._differentiate(batch, seed)
         with torch.no_grad():
             # Read on the host: with a GPU, its queue runs empty here once a step. An update that is chosen on the
-            # device would have to write every buffer anew.
+            # device would have to write every buffer again.
             finite = bool(torch.stack([metrics["loss/total"].double(), metrics["gradient_norm"]]).isfinite().all())
             applied = finite and not self._stopped
             self._stopped = self._nonfinite == "stop" and not applied

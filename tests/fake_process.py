@@ -1,4 +1,4 @@
-"""An implementation behind the process door that shares no code with the kit, and that misbehaves as its argument says.
+"""An implementation behind the process interface that shares no code with the kit, and that misbehaves as its argument says.
 
 It knows symlog, refuses what is not finite, and holds every message in both directions against the schema of the
 protocol.
@@ -95,8 +95,8 @@ def misbehave(reply):
         time.sleep(600)
     write(
         {
-            "babble": "loading weights...\n42\n" + '{"level": "info"}\n' + reply,
-            "endless babble": "nothing\n" * 1000,
+            "unexpected output": "loading weights...\n42\n" + '{"level": "info"}\n' + reply,
+            "endless unexpected output": "nothing\n" * 1000,
             "wrong id": '{"id": 7777, "result": null}',
             "neither": reply.replace('"result"', '"answer"'),
             "error without a message": reply.partition(",")[0] + ', "error": {"kind": "ValueError"}}',

@@ -241,7 +241,7 @@ def test_what_a_callback_raises_comes_out_and_nothing_is_left_behind() -> None:
     with pytest.raises(ZeroDivisionError, match="in the callback"):
         train(options(), fail)
     assert handlers() == before
-    assert train(options()).finished, "the log directory is free, and the run begins anew"
+    assert train(options()).finished, "the log directory is free, and a new run begins"
 
 
 # Signals

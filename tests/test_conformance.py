@@ -16,7 +16,7 @@ from impl_torch import layers
 
 
 def marks(backend: str, dtype: str, profile: str, check: Check) -> list[pytest.MarkDecorator]:
-    # JAX compiles every function and shape anew, so that it gets one pass here; PyTorch gets both profiles and float32.
+    # JAX compiles every function for each shape, so that it gets one pass here; PyTorch gets both profiles and float32.
     quick = (dtype == "float64" and profile == "paper") or (
         backend == "torch" and (dtype, profile) != ("float32", "official")
     )

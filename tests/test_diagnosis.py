@@ -1,4 +1,4 @@
-"""The diagnosis names the mistake: of every mutant as if a stranger had written it, of backends, and of nothing where
+"""The diagnosis names the mistake: of every mutant as if it were a third-party implementation, of backends, and of nothing where
 there is nothing."""
 
 import dataclasses
@@ -28,7 +28,7 @@ reach = functools.cache(lambda: sound(selected_checks("float64"), EXAMPLES)[0])
 
 
 def diagnosed(name: str) -> list[Diagnosis]:
-    """Of a mutant as a stranger's implementation."""
+    """Of a mutant as a third-party implementation."""
     mutant = MUTANTS[name]
     results = list(trial(mutant, relevant(mutant, reach()), EXAMPLES))
     unmoved = [Result(check, "pass", Worst(), 1) for check in reach() if not reach()[check] & mutant.edits.keys()]

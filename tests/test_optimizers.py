@@ -157,7 +157,7 @@ def test_the_transformation_of_jax_is_the_optimizer_step() -> None:
             assert_close(getattr(optimizer_state[1], moment), state[moment])
 
 
-# As a stranger uses them
+# As a user calls them
 
 
 def test_torch_learns_a_line() -> None:

@@ -1,4 +1,4 @@
-"""The process door: whatever the other side does, there is a result, and it says what happened."""
+"""The process interface: whatever the other side does, there is a result, and it says what happened."""
 
 import ast
 import contextlib
@@ -121,7 +121,7 @@ BROKEN = {
     "half line": ("ended with exit code 0 in the middle of a line",),
     "half line and hang": ("no reply within 0.5 s", "bytes of an unfinished line"),
     "close": ("closed its standard output",),
-    "endless babble": ("more than 100 lines on standard output are no messages, the last: 'nothing'",),
+    "endless unexpected output": ("more than 100 lines on standard output are no messages, the last: 'nothing'",),
     "wrong id": ("answered request 7777 where 2 was asked",),
     "neither": ("either a result or an error", "answer"),
     "error without a message": ("either a result or an error",),
@@ -203,8 +203,8 @@ def test_the_whole_conversation_has_a_limit() -> None:
         assert result.message == "its replies have taken more than 6000 s in all, 100 times --timeout"
 
 
-def test_babble_is_shown_and_left_out(capfd: pytest.CaptureFixture[str]) -> None:
-    with fake("babble") as adapter:
+def test_unexpected_output_is_shown_and_left_out(capfd: pytest.CaptureFixture[str]) -> None:
+    with fake("unexpected output") as adapter:
         assert adapter.symlog(np.zeros(2)).tolist() == [0, 0]
     shown = capfd.readouterr().err
     assert "loading weights..." in shown
@@ -466,7 +466,7 @@ def test_other_dtypes_are_converted() -> None:
 
 @pytest.mark.slow
 def test_every_check_works_through_a_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The reference behind the door passes all checks but those of objects with methods, and every request of these is
+    """The reference in a process passes all checks but those of objects with methods, and every request of these is
     valid."""
     schema = json.loads((ROOT / "conformance" / "protocol.schema.json").read_text(encoding="utf-8"))
     validator = jsonschema.Draft202012Validator({"$ref": "#/$defs/request", "$defs": schema["$defs"]})

@@ -215,7 +215,7 @@ def test_a_forged_command_names_no_code_and_no_other_place(capsys: pytest.Captur
     main(["--backend=jax", "--size=tiny", *SMALL, *SHORT, "--task=gym:CartPole-v1", "--logdir=run"])
     about = read_about(Path("run"))
     assert about
-    (tmp_path / "evil.py").write_text("raise SystemExit('code of a stranger')")
+    (tmp_path / "evil.py").write_text("raise SystemExit('code of somebody else')")
     for task in ("evil:make", "gym:evil:Env-v0"):
         words = [*shlex.split(about["command"]), "--task", task, "--logdir", "other"]
         Path("run/run.json").write_text(json.dumps(about | {"command": shlex.join(words)}))

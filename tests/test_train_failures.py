@@ -98,7 +98,7 @@ def test_an_environment_that_fails_in_its_trial_gets_a_process(tmp_path: Path, w
         else functools.partial(make_moody, "reset", tmp_path / "counter", 9)
     )
     assert try_out(make, told.append, seed=0).deserves_process
-    assert [failure.kind for failure in told] == ["garbage" if where == "step" else "error"]
+    assert [failure.kind for failure in told] == ["invalid data" if where == "step" else "error"]
 
 
 @pytest.mark.parametrize(("where", "words"), [("make", "when it was made"), ("reset", "at its first reset")])

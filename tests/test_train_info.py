@@ -9,7 +9,7 @@ from train_fakes import EPISODE, FakeLearner
 from train_runs import Make, logged
 
 from dreamer_spec.envs import ContractEnv
-from dreamer_spec.envs.adapter import Garbage
+from dreamer_spec.envs.adapter import InvalidData
 from dreamer_spec.envs.info import chosen, names_of
 from dreamer_spec.errors import UserError
 from dreamer_spec.training import loop
@@ -83,7 +83,7 @@ def test_an_invalid_number_is_invalid_data_of_the_environment() -> None:
     env.reset()
     for _ in range(EPISODE - 1):
         assert env.step(np.float32([0, 0]))[4] == {}, "only the last step counts"
-    with pytest.raises(Garbage, match=rf"task t, environment 0, step {EPISODE}.*'bad'"):
+    with pytest.raises(InvalidData, match=rf"task t, environment 0, step {EPISODE}.*'bad'"):
         env.step(np.float32([0, 0]))
 
 

@@ -265,7 +265,7 @@ RUN = {
 @pytest.mark.slow
 def test_a_run_that_changes_the_backend_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """CartPole for 300 steps on JAX, 300 on PyTorch, 300 on JAX again. Generators differ, so the losses cannot be
-    equal: they lie no further from those just before than these lie from each other. A learner that had begun anew
+    equal: they lie no further from those just before than these lie from each other. A learner that had started over
     would be far outside."""
     common = [f"--{name}={value}" for name, value in RUN.items()]
     for backend, steps in (("jax", 300), ("torch", 600), ("jax", 900)):
@@ -294,7 +294,7 @@ def test_a_run_that_changes_the_backend_goes_on(tmp_path: Path, capsys: pytest.C
     for before, after in ((losses[250], losses[300]), (losses[550], losses[600])):
         spread = before.max() - before.min()
         assert before.min() - spread < after[:12].mean() < before.max() + spread
-    assert lines[0]["train/loss/total"] > 1.5 * losses[300].max(), "what a learner that began anew would show"
+    assert lines[0]["train/loss/total"] > 1.5 * losses[300].max(), "what a learner that started over would show"
 
 
 @pytest.mark.parametrize(("name", "reason"), [("", "Is a directory"), ("no/result.json", "there is no folder")])

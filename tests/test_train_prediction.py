@@ -34,7 +34,7 @@ LENGTH, SEEN = 6, 2
 
 
 def recorded() -> tuple[Arrays, np.ndarray, np.ndarray]:
-    """Observations, previous actions, is_first; row 1 begins anew at step 4."""
+    """Observations, previous actions, is_first; row 1 restarts at step 4."""
     rng = np.random.default_rng(0)
     is_first = np.zeros((2, LENGTH), bool)
     is_first[:, 0] = is_first[1, 4] = True

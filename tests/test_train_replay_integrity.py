@@ -47,7 +47,7 @@ def spoil_header(path: Path) -> None:
     flip(path, 60)
 
 
-def garbage(path: Path) -> None:
+def random_bytes(path: Path) -> None:
     path.write_bytes(b"\xff" * path.stat().st_size)
 
 
@@ -66,7 +66,7 @@ DAMAGES: dict[str, tuple[Callable[[Path, Replay], None], str]] = {
     "empty": (lambda path, replay: os.truncate(path, 0), "has 0 bytes"),
     "missing": (lambda path, replay: path.unlink(), "is missing"),
     "header": (lambda path, replay: spoil_header(path), "damaged header"),
-    "garbage": (lambda path, replay: garbage(path), "damaged header"),
+    "random bytes": (lambda path, replay: random_bytes(path), "damaged header"),
     "a directory": (lambda path, replay: (path.unlink(), path.mkdir()), "is not a file"),
 }
 

@@ -1,4 +1,4 @@
-"""Environments that crash, raise, hang or return garbage: what `dreamer_spec.envs.Environments` makes of them."""
+"""Environments that crash, raise, hang or return invalid data: what `dreamer_spec.envs.Environments` makes of them."""
 
 import functools
 import os
@@ -55,7 +55,14 @@ def stream(records: list[dict[str, np.ndarray]], worker: int) -> Stream:
     return [{key: value[worker].tolist() for key, value in record.items()} for record in records]
 
 
-KINDS = [("error", False), ("garbage", False), ("error", True), ("garbage", True), ("timeout", True), ("crash", True)]
+KINDS = [
+    ("error", False),
+    ("invalid data", False),
+    ("error", True),
+    ("invalid data", True),
+    ("timeout", True),
+    ("crash", True),
+]
 
 
 @pytest.mark.parametrize(("kind", "processes"), KINDS)
@@ -69,8 +76,8 @@ def test_a_failed_environment_begins_anew_and_the_others_do_not_notice(make: Mak
     expected = [calm_envs.reset(SEEDS), *(calm_envs.step(calm(3)) for _ in range(len(records) - 1))]
     for worker in (0, 2):
         assert stream(records, worker) == stream(expected, worker)
-    anew = make("Fragile", 1, False)
-    restarted = [anew.reset([derive_seed(SEEDS[VICTIM], "restart", 0)]), *(anew.step(calm(1)) for _ in range(12))]
+    again = make("Fragile", 1, False)
+    restarted = [again.reset([derive_seed(SEEDS[VICTIM], "restart", 0)]), *(again.step(calm(1)) for _ in range(12))]
     assert stream(records, VICTIM)[:before] == stream(expected, VICTIM)[:before]
     assert stream(records, VICTIM)[before:] == stream(restarted, 0)
     assert [records[before][flag][VICTIM] for flag in ("is_first", "is_last", "reward")] == [True, False, 0]
@@ -81,7 +88,7 @@ def test_a_failed_environment_begins_anew_and_the_others_do_not_notice(make: Mak
     assert "task train_fakes:Fragile, environment 1, step 7: " in failure.message
     words = {
         "error": "ZeroDivisionError: inside",
-        "garbage": "the reward is nan",
+        "invalid data": "the reward is nan",
         "timeout": "within 3 seconds",
         "crash": "SIGKILL",
     }
@@ -167,9 +174,9 @@ def test_failures_of_long_ago_are_forgotten(make: Make, monkeypatch: pytest.Monk
         for _ in range(EPISODE + 2):  # At the end of an episode the action would be ignored.
             envs.step(calm(2))
     assert envs.failures == 3
-    envs.step(trouble("garbage", 1, 2))
+    envs.step(trouble("invalid data", 1, 2))
     with pytest.raises(UserError, match="failed 2 times within 10 records"):
-        envs.step(trouble("garbage", 1, 2))
+        envs.step(trouble("invalid data", 1, 2))
 
 
 @pytest.mark.parametrize("processes", [False, True])

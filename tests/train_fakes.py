@@ -269,7 +269,7 @@ class Fragile(Counting):
     gives that trouble.
     """
 
-    TROUBLES: ClassVar[dict[float, str]] = {0.25: "error", 0.5: "garbage", 0.75: "timeout", 1.0: "crash"}
+    TROUBLES: ClassVar[dict[float, str]] = {0.25: "error", 0.5: "invalid data", 0.75: "timeout", 1.0: "crash"}
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -285,7 +285,7 @@ class Fragile(Counting):
         observation[1] = self.np_random.random()
         if trouble == "error":
             raise ZeroDivisionError("inside\nthe environment")
-        if trouble == "garbage":
+        if trouble == "invalid data":
             reward = np.nan
         if trouble == "timeout":
             time.sleep(60)

@@ -24,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--diagnose",
         action="store_true",
-        help="check each as if a stranger had written it, and see whether it is named",
+        help="check each as if it were a third-party implementation, and see whether it is named",
     )
     parser.add_argument("--json", type=Path, default=None, metavar="FILE", help="write the results to this file, too")
 

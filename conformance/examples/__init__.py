@@ -1,1 +1,1 @@
-"""Adapters for packages of others: see docs/strangers.md."""
+"""Adapters for packages of others: see docs/third-party.md."""

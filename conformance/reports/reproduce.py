@@ -52,7 +52,7 @@ def command(name: str, options: CheckOptions) -> str:
 def snippet(name: str, call: FailedCall | None, options: CheckOptions) -> str:
     """Python that makes the failing call again.
 
-    Arguments of up to WRITTEN_OUT numbers are written out. Larger ones are made anew by running the check; so is a call
+    Arguments of up to WRITTEN_OUT numbers are written out. Larger ones come from running the check again; so is a call
     that makes an object, which fails in one of its methods.
     """
     adapter = _adapter(options)

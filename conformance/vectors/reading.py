@@ -56,7 +56,7 @@ def read_index(directory: Path) -> dict[str, Any]:
         ) from error
     if index.get("format") != FORMAT:
         raise UserError(
-            f"{directory} has vectors of the format {index.get('format')!r}, expected {FORMAT}; write them anew"
+            f"{directory} has vectors of the format {index.get('format')!r}, expected {FORMAT}; write them again"
         )
     return index
 

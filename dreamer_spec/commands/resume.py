@@ -1,5 +1,5 @@
 """`train resume RUN`: continues a run with the options that it was started with, which run.json holds, but for those
-given anew."""
+given here."""
 
 import shlex
 from collections.abc import Mapping, Sequence

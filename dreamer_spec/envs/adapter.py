@@ -21,7 +21,7 @@ Observation = dict[str, np.ndarray]
 FLOAT32_MAX = float(np.finfo(np.float32).max)
 
 
-class Garbage(UserError):
+class InvalidData(UserError):
     """An environment returned what its spaces, or Gymnasium's interface, do not allow: [LOOP-31]."""
 
 
@@ -37,7 +37,7 @@ class ContractEnv(gymnasium.Env[Observation, np.ndarray]):
 
     Raises:
       UserError: an unsupported space.
-      Garbage: from `reset` and `step`, whatever the environment returns that its spaces do not allow, NaN included.
+      InvalidData: from `reset` and `step`, whatever the environment returns that its spaces do not allow, NaN included.
     """
 
     def __init__(
@@ -84,7 +84,7 @@ class ContractEnv(gymnasium.Env[Observation, np.ndarray]):
             self._seed, self._episode = seed, (options or {}).get("episode", 0)
         value = self._env.reset(seed=None if self._seed is None else derive_seed(self._seed, "episode", self._episode))
         if not isinstance(value, tuple) or len(value) != 2:
-            raise self._garbage(f"reset returned {_describe(value)}; Gymnasium's reset returns (observation, info)")
+            raise self._invalid(f"reset returned {_describe(value)}; Gymnasium's reset returns (observation, info)")
         return self._observation(value[0]), {}
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -93,7 +93,7 @@ class ContractEnv(gymnasium.Env[Observation, np.ndarray]):
         for _ in range(self._action_repeat):
             value = self._env.step(self.translation.action(action))  # A new one: an environment may write into it.
             if not isinstance(value, tuple) or len(value) != 5:
-                raise self._garbage(
+                raise self._invalid(
                     f"step returned {_describe(value)}; Gymnasium's step returns (observation, reward, "
                     f"terminated, truncated, info)"
                 )
@@ -103,7 +103,7 @@ class ContractEnv(gymnasium.Env[Observation, np.ndarray]):
             if terminated or truncated:
                 break
         if abs(total) > FLOAT32_MAX:
-            raise self._garbage(
+            raise self._invalid(
                 f"the rewards of {self._action_repeat} repeated actions add up to {total}, more than float32 can hold"
             )
         extra = {"metrics": self._metrics(info)} if self._info_metrics and (terminated or truncated) else {}
@@ -126,32 +126,32 @@ class ContractEnv(gymnasium.Env[Observation, np.ndarray]):
         try:
             return self.translation.observation(value)
         except ValueError as error:
-            raise self._garbage(str(error)) from error
+            raise self._invalid(str(error)) from error
 
     def _metrics(self, info: Any) -> EpisodeInfo:
         try:
             return chosen(info, self._info_metrics)
         except UserError as error:
-            raise self._garbage(str(error)) from error
+            raise self._invalid(str(error)) from error
 
     def _reward(self, value: Any) -> float:
         array = np.asarray(value)
         if array.size != 1 or array.dtype.kind not in "fiub":
-            raise self._garbage(f"the reward is {_describe(value)}; expected one number")
+            raise self._invalid(f"the reward is {_describe(value)}; expected one number")
         reward = float(array.reshape(()))
         if not math.isfinite(reward) or abs(reward) > FLOAT32_MAX:
-            raise self._garbage(f"the reward is {reward}; expected a finite number")
+            raise self._invalid(f"the reward is {reward}; expected a finite number")
         return reward
 
     def _flag(self, name: str, value: Any) -> bool:
         """Python finds a truth in everything: a NaN or the text "False" would end the episode. [LOOP-47]"""
         array = np.asarray(value)
         if array.size != 1 or array.dtype.kind not in "biu" or array.item() not in (0, 1):
-            raise self._garbage(f"{name} is {f'{value!r}'[:80]}; expected True or False")
+            raise self._invalid(f"{name} is {f'{value!r}'[:80]}; expected True or False")
         return bool(array.item())
 
-    def _garbage(self, message: str) -> Garbage:
-        return Garbage(f"{where(self.task, self._index, self._steps)}: {message}")
+    def _invalid(self, message: str) -> InvalidData:
+        return InvalidData(f"{where(self.task, self._index, self._steps)}: {message}")
 
 
 def where(task: str, index: int, steps: int) -> str:

@@ -7,7 +7,7 @@ import traceback
 from collections.abc import Callable
 from typing import Literal, TypeVar
 
-from dreamer_spec.envs.adapter import Garbage
+from dreamer_spec.envs.adapter import InvalidData
 from dreamer_spec.envs.factory import Refusal
 from dreamer_spec.errors import UserError
 from dreamer_spec.system.signals import Stopped
@@ -25,13 +25,13 @@ class Failure:
     """An environment did not give its next record.
 
     worker: its index. kind: its process ended ("crash"), it raised ("error"), did not answer in time ("timeout"), or
-    returned what its spaces do not allow ("garbage"). message: names task, environment and step. details: the traceback
+    returned what its spaces do not allow ("invalid data"). message: names task, environment and step. details: the traceback
     of an error, else empty.
     certain: whether another attempt would end alike, as with a task that does not exist.
     """
 
     worker: int
-    kind: Literal["crash", "error", "timeout", "garbage"]
+    kind: Literal["crash", "error", "timeout", "invalid data"]
     message: str
     details: str = ""
     certain: bool = False
@@ -54,8 +54,8 @@ def attempt(work: Callable[[], Result], worker: int, place: Callable[[], str]) -
     try:
         return work()
     except UserError as error:
-        kind: Literal["garbage", "error"] = "garbage" if isinstance(error, Garbage) else "error"
-        return Failure(worker, kind, str(error), error.details, certain=not isinstance(error, Garbage | Refusal))
+        kind: Literal["invalid data", "error"] = "invalid data" if isinstance(error, InvalidData) else "error"
+        return Failure(worker, kind, str(error), error.details, certain=not isinstance(error, InvalidData | Refusal))
     except BaseException as error:
         if isinstance(error, Stopped) or _is_the_users(error):
             raise

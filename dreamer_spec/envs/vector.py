@@ -35,7 +35,7 @@ class Environments:
     is known of these environments, if they have been tried out. task: for messages, where they have not.
 
     `start(action)` sends the actions off, `finish()` waits for the records: what happens in between overlaps with the
-    environments where they have processes of their own. `reset(seeds)` begins everywhere anew, and seeds this episode
+    environments where they have processes of their own. `reset(seeds)` restarts all of them, and seeds this episode
     and all after it.
 
     An environment that crashes, raises, hangs or returns what its spaces do not allow is restarted: another is made and

@@ -42,7 +42,7 @@ class SequenceRecorder:
 def predict(learner: Learner, spaces: Spaces, sequences: Sequences, seed: int) -> dict[str, np.ndarray]:
     """The open-loop prediction of sequences after `CONTEXT` steps: see `Learner.predict`. seed: of its random numbers.
 
-    Sequences shorter than `STEPS` are filled up, and the result cut again: a backend may compile anew for every length,
+    Sequences shorter than `STEPS` are filled up, and the result cut again: a backend may compile for every length,
     and nothing that comes later changes what is predicted before.
     """
     steps = sequences["is_first"].shape[1]

@@ -77,8 +77,7 @@ def report_failures(envs: Environments, say: Callable[[str], None]) -> None:
 
 
 def report_failure(failure: Failure, say: Callable[[str], None]) -> None:
-    kind = "invalid data" if failure.kind == "garbage" else failure.kind
-    say(f"environment {failure.worker} failed and was restarted ({kind}): {failure.message}")
+    say(f"environment {failure.worker} failed and was restarted ({failure.kind}): {failure.message}")
 
 
 class Agent:

@@ -94,14 +94,14 @@ def find(options: Options, display: Display) -> Checkpoint | None:
     if damaged:
         raise UserError(
             f"{options.logdir} has damaged checkpoints only: {', '.join(map(str, damaged))}; "
-            f"to begin anew, choose another --logdir"
+            f"to start over, choose another --logdir"
         )
     require_free(options.logdir)
     return None
 
 
 def changes(saved: Checkpoint, options: Options) -> dict[str, list[Any]]:
-    """What the run of a checkpoint is given anew: name -> [value before, value from here on]. [LOOP-70]
+    """The options that the run of a checkpoint is given: name -> [value before, value from here on]. [LOOP-70]
 
     Of what a checkpoint does not hold, such as --steps, run.json says what it was.
     """

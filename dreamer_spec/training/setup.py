@@ -145,7 +145,7 @@ def _say_start(run: TrainingRun, about: About) -> None:
 
 
 def _progress(options: Options, saved: Checkpoint | None) -> tuple[int, int]:
-    """How often the environments began anew, and the environment step."""
+    """How often the environments were restarted, and the environment step."""
     if not saved:
         return 0, 0
     return saved.info["counters"]["starts"], saved.info["counters"]["records"] * options.action_repeat

@@ -18,8 +18,8 @@ from reference_numpy.training_loop import ReplayRatio
 
 @dataclasses.dataclass
 class Counters:
-    """How far a run is. records: environment steps without action repeat; starts: how often all environments began
-    anew; due: train steps that wait for the end of an episode."""
+    """How far a run is. records: environment steps without action repeat; starts: how often all environments were
+    restarted; due: train steps that wait for the end of an episode."""
 
     records: int = 0
     policy_steps: int = 0

@@ -12,7 +12,7 @@ from dreamer_spec.errors import UserError
 from dreamer_spec.options import Options
 from spec import Spaces, parameter_table
 
-TAKEN = ("params/", "slow_critic/", "return_range/")  # the optimizer begins anew
+TAKEN = ("params/", "slow_critic/", "return_range/")  # the optimizer starts from zero
 
 
 def begin_from(options: Options, learner: Learner, spaces: Spaces) -> dict[str, Any]:

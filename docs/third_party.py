@@ -1,7 +1,7 @@
-"""What the kit says of packages of others: the tables of docs/strangers.md.
+"""What the kit says of packages of others: the tables of docs/third-party.md.
 
-`python -m docs.strangers NAME result.json` keeps of a result of `conformance check --json` what the tables need, as
-docs/results/stranger-NAME.json. Why a check fails is said by people, in conformance/examples/findings.toml.
+`python -m docs.third_party NAME result.json` keeps of a result of `conformance check --json` what the tables need, as
+docs/results/third-party-NAME.json. Why a check fails is said by people, in conformance/examples/findings.toml.
 """
 
 import json
@@ -25,7 +25,7 @@ Data = dict[str, Any]
 
 
 def reduce(name: str, result: Data) -> Data:
-    """Of a result of the kit what is kept of a stranger. A message is kept up to its first line; of an error the last,
+    """Of a result of the kit what is kept of a package. A message is kept up to its first line; of an error the last,
     the exception."""
     offered = {
         check: entry for check, entry in result["checks"].items() if entry["status"] not in ("not offered", NOT_JUDGED)
@@ -35,7 +35,7 @@ def reduce(name: str, result: Data) -> Data:
         "package": name,
         "version": result["implementation"]["version"],
         "date": result["date"],
-        "door": "process" if result["process"] else "module",
+        "interface": "process" if result["process"] else "module",
         **{key: result[key] for key in ("dtype", "edition", "choice", "seed", "examples", "versions")},
         "checks": {
             check: {key: entry[key] for key in ("status", "requirements", "compared", "extreme")}
@@ -56,9 +56,9 @@ def _brief(entry: Data) -> str:
     return line if len(line) <= MESSAGE_LENGTH else f"{line[:MESSAGE_LENGTH]}..."
 
 
-def strangers() -> dict[str, Data]:
+def results() -> dict[str, Data]:
     """The committed results: package -> what `reduce` kept."""
-    results = (json.loads(path.read_text(encoding="utf-8")) for path in sorted(RESULTS.glob("stranger-*.json")))
+    results = (json.loads(path.read_text(encoding="utf-8")) for path in sorted(RESULTS.glob("third-party-*.json")))
     return {result["package"]: result for result in results}
 
 
@@ -78,9 +78,9 @@ def kind_of(package: Data, check: str) -> str:
 
 
 def summary_table() -> str:
-    """One line for each stranger."""
+    """One line for each package."""
     rows = []
-    for name, result in strangers().items():
+    for name, result in results().items():
         package, failed = findings()[name], failing(result)
         kinds = [kind_of(package, check) for check in failed]
         extreme = sum(result["checks"][check]["extreme"] for check in failed)
@@ -110,8 +110,8 @@ def summary_table() -> str:
 
 
 def finding_sections() -> str:
-    """A section for each stranger: what was offered, what passes, and why the rest does not."""
-    return "\n".join(_section(findings()[name], result) for name, result in strangers().items())
+    """A section for each package: what was offered, what passes, and why the rest does not."""
+    return "\n".join(_section(findings()[name], result) for name, result in results().items())
 
 
 def _section(package: Data, result: Data) -> str:
@@ -161,7 +161,7 @@ def _table(header: list[str], rows: list[list[str]]) -> str:
 
 def main() -> int:
     name, path = sys.argv[1:]
-    kept = RESULTS / f"stranger-{name}.json"
+    kept = RESULTS / f"third-party-{name}.json"
     kept.write_text(json.dumps(reduce(name, read(Path(path))), indent=1) + "\n", encoding="utf-8")
     print(f"wrote {kept.relative_to(ROOT)}")
     return 0

@@ -1,4 +1,4 @@
-"""A code base as a stranger might write it: PyTorch, time first, names, layouts and habits of its own. It knows nothing
+"""A code base as somebody else might write it: PyTorch, time first, names, layouts and habits of its own. It knows nothing
 of the kit."""
 
 import torch

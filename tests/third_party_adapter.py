@@ -1,6 +1,6 @@
-"""Our adapter. The code base is time first and flat; `stranger_code` itself stays as it is."""
+"""Our adapter. The code base is time first and flat; `third_party_code` itself stays as it is."""
 
-import stranger_code as code
+import third_party_code as code
 import torch
 
 __version__ = "2.1"

@@ -1,4 +1,4 @@
-"""The module and the state door: what strangers write is understood, and what it does wrong is found."""
+"""Adapters that are modules, and those that map state: what other people write is understood, and what it does wrong is found."""
 
 import dataclasses
 import inspect
@@ -329,10 +329,10 @@ def test_an_adapter_does_not_end_the_kit(tmp_path: Path) -> None:
         candidate.load_candidate(str(tmp_path / "script.py"), "float64")
 
 
-# --- A stranger
+# --- A third-party implementation
 # ------------------------------------------------------------------------------
 
-STRANGER = TESTS / "stranger_adapter.py"
+THIRD_PARTY = TESTS / "third_party_adapter.py"
 PASSES = (
     *("returns.lambda_return_literals", "returns.lambda_return_matches", "returns.lambda_return_ignores_the_start"),
     *("transforms.twohot_literals", "world_model.kl_matches", "sampling.latents_have_their_frequencies"),
@@ -341,20 +341,20 @@ PASSES = (
 
 
 @pytest.mark.parametrize("name", PASSES)
-def test_the_stranger_passes(name: str) -> None:
+def test_a_third_party_implementation_passes(name: str) -> None:
     """A code base that is time first, flat, and has layouts of its own, through an adapter of at most 60 lines."""
-    assert len(STRANGER.read_text(encoding="utf-8").splitlines()) <= 60
-    result = run(name, ModuleAdapter(load_file(STRANGER), "float64"))
+    assert len(THIRD_PARTY.read_text(encoding="utf-8").splitlines()) <= 60
+    result = run(name, ModuleAdapter(load_file(THIRD_PARTY), "float64"))
     assert result.status == "pass", result.message
 
 
-def test_a_mistake_of_the_stranger_is_found() -> None:
+def test_a_mistake_of_a_third_party_implementation_is_found() -> None:
     """Its λ-return with the value of the state that is left: the paper's printed indices."""
-    stranger = load_file(STRANGER)
-    right = stranger.code.lambda_values
+    theirs = load_file(THIRD_PARTY)
+    right = theirs.code.lambda_values
     late = types.SimpleNamespace(lambda_values=lambda rewards, values, *rest: right(rewards, values.roll(1, 0), *rest))
-    stranger.code = late
-    assert run("returns.lambda_return_matches", ModuleAdapter(stranger, "float64")).status == "fail"
+    theirs.code = late
+    assert run("returns.lambda_return_matches", ModuleAdapter(theirs, "float64")).status == "fail"
 
 
 # --- The document

@@ -1,4 +1,4 @@
-"""The adapters for packages of others: the checks pass and fail as docs/strangers.md says, for the reasons that it
+"""The adapters for packages of others: the checks pass and fail as docs/third-party.md says, for the reasons that it
 gives."""
 
 import sys
@@ -10,7 +10,7 @@ import pytest
 from conformance.candidate import candidate
 from conformance.editions import judge
 from conformance.execute import Result, missing, selected_checks
-from docs.strangers import FAILING, KINDS, failing, findings, reduce, strangers
+from docs.third_party import FAILING, KINDS, failing, findings, reduce, results
 from spec import editions
 
 SERVE = Path(__file__).resolve().parent.parent / "conformance" / "serve.py"
@@ -20,10 +20,10 @@ FEW, MANY = 10, 250  # cases of a property
 SLOW = {"equinox", "haiku"}  # JAX compiles each layer of each shape
 BESIDE_US = [
     pytest.param(name, marks=pytest.mark.slow if name in SLOW else ())
-    for name, result in strangers().items()
-    if result["door"] == "module"
+    for name, result in results().items()
+    if result["interface"] == "module"
 ]
-ALONE = [name for name, result in strangers().items() if result["door"] == "process"]
+ALONE = [name for name, result in results().items() if result["interface"] == "process"]
 SCRIPTS = [
     pytest.param(package, finding["script"], id=f"{package} {check}")
     for package, entries in findings().items()
@@ -34,7 +34,7 @@ SCRIPTS = [
 
 def recorded_version(name: str) -> str:
     """The version that the results were recorded with, which is installed; skips the test if it is not."""
-    version = strangers()[name]["version"]
+    version = results()[name]["version"]
     installed = getattr(pytest.importorskip(MODULES.get(name, name)), "__version__", "")
     if installed != version:
         pytest.skip(f"recorded with {name} {version}, installed is {installed}")
@@ -56,7 +56,7 @@ def failing_checks(adapter: object, result: dict[str, Any], names: set[str], exa
 def test_the_kit_finds_what_is_recorded(name: str) -> None:
     """What fails in a few cases has failed in the many of the record; what has failed there and not here fails in very
     many: which cases are drawn depends on the code, and some deviations are rare."""
-    version, result = recorded_version(name), strangers()[name]
+    version, result = recorded_version(name), results()[name]
     recorded = set(failing(result))
     with candidate(str(EXAMPLES / f"{name}_adapter.py"), None, result["dtype"], None, 60) as adapter:
         assert adapter.version == version
@@ -70,9 +70,9 @@ def test_the_kit_finds_what_is_recorded(name: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ALONE)
 def test_the_kit_finds_what_is_recorded_through_a_process(name: str) -> None:
-    """Each of these needs an environment of its own, with this project beside it: docs/strangers.md says which."""
+    """Each of these needs an environment of its own, with this project beside it: docs/third-party.md says which."""
     pytest.importorskip(MODULES.get(name, name))
-    result = strangers()[name]
+    result = results()[name]
     with candidate(
         None, f"{sys.executable} {SERVE} {EXAMPLES / f'{name}_adapter.py'}", result["dtype"], None, 300
     ) as adapter:
@@ -84,11 +84,11 @@ def test_the_kit_finds_what_is_recorded_through_a_process(name: str) -> None:
     }
 
 
-@pytest.mark.parametrize("name", strangers())
+@pytest.mark.parametrize("name", results())
 def test_every_failure_is_explained_and_every_explanation_is_of_a_failure(name: str) -> None:
     package = dict(findings()[name])
     assert all(package.pop(key) for key in ("title", "url", "offers"))
-    assert set(package) == set(failing(strangers()[name]))
+    assert set(package) == set(failing(results()[name]))
     for finding in package.values():
         if "same" in finding:
             assert set(finding) == {"same"}
@@ -158,6 +158,6 @@ def test_a_result_is_reduced_to_what_is_shown() -> None:
             "message": "TypeError: no",
         },
     }
-    assert (kept["package"], kept["version"], kept["door"]) == ("theirs", "1.2", "module")
+    assert (kept["package"], kept["version"], kept["interface"]) == ("theirs", "1.2", "module")
     assert (kept["not_offered"], kept["not_judged"]) == (1, 1)
     assert kept["diagnoses"] == [{"mutant": "m", "explained": ["bad"]}]
