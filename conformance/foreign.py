@@ -1,4 +1,4 @@
-"""What third-party functions return, brought into the form that the checks compare: only where it can mean one thing."""
+"""What third-party functions return, in the form that the checks compare: only where it can mean one thing."""
 
 import abc
 import inspect

@@ -1,9 +1,9 @@
-"""The process interface: an implementation in a process of its own, asked by JSON lines over its standard input and output.
+"""The process interface: an implementation in a process of its own, asked by JSON lines over its standard streams.
 
 Every request has one reply, and the next request is sent after it. Whatever the other side does, the kit gets a result:
-a process that dies, hangs, prints without end or breaks the protocol is `CandidateLost`, which ends the check; the next check
-restarts it. The messages are those of protocol.schema.json, docs/adapters.md explains them, serve.py is the other
-side for Python.
+a process that dies, hangs, prints without end or breaks the protocol is `CandidateLost`, which ends the check; the
+next check restarts it. The messages are those of protocol.schema.json, docs/adapters.md explains them, serve.py is the
+other side for Python.
 """
 
 import collections

@@ -1,4 +1,4 @@
-"""An implementation behind the process interface that shares no code with the kit, and that misbehaves as its argument says.
+"""An implementation behind the process interface that shares no code with the kit and misbehaves as its argument says.
 
 It knows symlog, refuses what is not finite, and holds every message in both directions against the schema of the
 protocol.

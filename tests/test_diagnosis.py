@@ -1,5 +1,5 @@
-"""The diagnosis names the mistake: of every mutant as if it were a third-party implementation, of backends, and of nothing where
-there is nothing."""
+"""The diagnosis names the mistake: of every mutant as if it were a third-party implementation, of backends, and of
+nothing where there is nothing."""
 
 import dataclasses
 import functools

@@ -1,4 +1,4 @@
-"""Adapters that are modules, and those that map state: what other people write is understood, and what it does wrong is found."""
+"""Adapters that are modules, and those that map state: other code is understood, and its mistakes are found."""
 
 import dataclasses
 import inspect

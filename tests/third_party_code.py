@@ -1,5 +1,5 @@
-"""A code base as somebody else might write it: PyTorch, time first, names, layouts and habits of its own. It knows nothing
-of the kit."""
+"""A code base as somebody else might write it: PyTorch, time first, names, layouts and habits of its own. It knows
+nothing of the kit."""
 
 import torch
 from torch import nn

@@ -42,9 +42,9 @@ def write_about(
 
     device: as the learner names it. parameters: how many numbers are trained. preflight: its result, None if it was
     skipped. resumed_at: the environment step of the checkpoint that is continued, None for a new run. given_anew: name
-    -> [value before, value from here on] of the options that a resumed run was given. origin: where the parameters of a new
-    run come from, if not from its seed. A resumed run keeps its `id`, its `origin` and its earlier `starts`; all else
-    describes this start. understood: what the environment's spaces became, in words.
+    -> [value before, value from here on] of the options that a resumed run was given. origin: where the parameters of a
+    new run come from, if not from its seed. A resumed run keeps its `id`, its `origin` and its earlier `starts`; all
+    else describes this start. understood: what the environment's spaces became, in words.
 
     Raises:
       UserError: the disk refuses it.

@@ -25,8 +25,8 @@ class Failure:
     """An environment did not give its next record.
 
     worker: its index. kind: its process ended ("crash"), it raised ("error"), did not answer in time ("timeout"), or
-    returned what its spaces do not allow ("invalid data"). message: names task, environment and step. details: the traceback
-    of an error, else empty.
+    returned what its spaces do not allow ("invalid data"). message: names task, environment and step. details: the
+    traceback of an error, else empty.
     certain: whether another attempt would end alike, as with a task that does not exist.
     """
 
