@@ -434,7 +434,7 @@ CONFIG_FIELDS: dict[str, tuple[str, ...]] = {
 """Functions of one part -> what of the configuration their results depend on, but for sizes, which the shapes show
 too."""
 
-COLUMNS = ("numpy", "jax", "torch")
+IMPLEMENTATIONS = ("numpy", "jax", "torch")
 
 
 def load_adapter(backend: str, dtype: str = "float64", device: str | None = None) -> object:
@@ -443,8 +443,8 @@ def load_adapter(backend: str, dtype: str = "float64", device: str | None = None
     Raises:
       ValueError: an unknown backend or dtype.
     """
-    if backend not in COLUMNS:
-        raise ValueError(f"unknown backend {backend!r}; known: {', '.join(COLUMNS)}")
+    if backend not in IMPLEMENTATIONS:
+        raise ValueError(f"unknown backend {backend!r}; known: {', '.join(IMPLEMENTATIONS)}")
     if dtype not in DTYPES:
         raise ValueError(f"unknown dtype {dtype!r}; known: {', '.join(DTYPES)}")
     return importlib.import_module(f"conformance.adapters.{backend}_adapter").make_adapter(dtype, device)

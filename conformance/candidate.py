@@ -10,7 +10,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from conformance.adapter import COLUMNS, INTERFACE, OBJECTS, load_adapter
+from conformance.adapter import IMPLEMENTATIONS, INTERFACE, OBJECTS, load_adapter
 from conformance.errors import UserError
 from conformance.foreign import ForeignAdapter, as_edition
 from conformance.own_names import ours, ours_in
@@ -87,7 +87,7 @@ def load_candidate(name: str, dtype: str, device: str | None = None) -> object:
       UserError: there is no such thing, or what it needs is not there. A mistake inside of somebody's module keeps its
         traceback.
     """
-    if name in COLUMNS:
+    if name in IMPLEMENTATIONS:
         try:
             return load_adapter(name, dtype, device)
         except ImportError as error:
@@ -119,7 +119,7 @@ def _load_module(name: str) -> ModuleType:
             raise UserError(f"no file {name}; `conformance new-adapter {name}` writes one to fill in")
         return load_file(Path(name))
     unknown = UserError(
-        f"no module named {name!r}; give one of {', '.join(COLUMNS)}, a module on PYTHONPATH, or a .py file"
+        f"no module named {name!r}; give one of {', '.join(IMPLEMENTATIONS)}, a module on PYTHONPATH, or a .py file"
     )
     if not all(part.isidentifier() for part in name.split(".")):
         raise unknown

@@ -3,7 +3,7 @@
 import ast
 from pathlib import Path
 
-from conformance.adapter import COLUMNS, load_adapter
+from conformance.adapter import IMPLEMENTATIONS, load_adapter
 from conformance.check import CHECKS
 from conformance.execute import missing, selected_checks
 from conformance.requirements import requirements
@@ -61,7 +61,7 @@ def coverage() -> tuple[dict[str, dict[str, list[str]]], list[str]]:
 def installed_adapters() -> dict[str, object]:
     """Column -> its adapter, for the columns whose libraries are installed."""
     found = {}
-    for column in COLUMNS:
+    for column in IMPLEMENTATIONS:
         try:
             found[column] = load_adapter(column)
         except ModuleNotFoundError as error:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from conformance.adapter import COLUMNS, load_adapter
+from conformance.adapter import IMPLEMENTATIONS, load_adapter
 from conformance.problems import make_problem
 from dreamer_spec.backend import learner_class
 
@@ -67,7 +67,7 @@ MISTAKES: list[tuple[str, tuple[Any, ...], str]] = [
 
 @pytest.mark.covers("CON-8")
 @pytest.mark.parametrize(("function", "arguments", "message"), MISTAKES)
-@pytest.mark.parametrize("column", COLUMNS)
+@pytest.mark.parametrize("column", IMPLEMENTATIONS)
 def test_an_error_says_the_same_in_every_column(
     column: str, function: str, arguments: tuple[Any, ...], message: str
 ) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from conformance.adapter import COLUMNS
+from conformance.adapter import IMPLEMENTATIONS
 from conformance.candidate import candidate, remarks
 from conformance.check import Check
 from conformance.compare import DTYPES
@@ -20,7 +20,7 @@ from conformance.results import Data, identity, result_data, write, write_text
 from spec import editions, find_edition
 
 # of our own columns, unless another is given: they follow the configuration, so there is nothing to find out
-COLUMN_EDITION = "paper"
+OUR_EDITION = "paper"
 RENDERED: dict[str, Callable[[Data], str]] = {
     "markdown": markdown.render,
     "junit": junit.render,
@@ -80,7 +80,7 @@ def main(console: Console, options: argparse.Namespace) -> int:
         for remark in remarks(adapter):
             console.print(remark, markup=False, highlight=False)
         implementation = identity(adapter, options.candidate or options.process or "")
-        given = options.edition or (COLUMN_EDITION if options.candidate in COLUMNS else None)
+        given = options.edition or (OUR_EDITION if options.candidate in IMPLEMENTATIONS else None)
         named = given or _claimed(implementation["edition"])
         fits = [] if named else _fit(console, checks, adapter, options)
         asked = CheckOptions(

@@ -6,7 +6,7 @@ import textwrap
 from rich.console import Console
 from rich.table import Table
 
-from conformance.adapter import COLUMNS
+from conformance.adapter import IMPLEMENTATIONS
 from conformance.coverage import coverage
 from conformance.requirements import requirements
 
@@ -19,7 +19,7 @@ def main(console: Console, options: argparse.Namespace) -> int:
     del options
     table, problems = coverage()
     view = Table()
-    columns = (*COLUMNS, "tests")
+    columns = (*IMPLEMENTATIONS, "tests")
     for column in ("requirement", *columns, "text"):
         view.add_column(column, min_width=len(column))
     for requirement, covering in table.items():
@@ -30,7 +30,7 @@ def main(console: Console, options: argparse.Namespace) -> int:
     for problem in problems:
         console.print(f"[bold red]{problem}")
     there = {column for covering in table.values() for column in covering}
-    if absent := [column for column in COLUMNS if column not in there]:
+    if absent := [column for column in IMPLEMENTATIONS if column not in there]:
         console.print(f"not installed, so not looked at: {', '.join(absent)}")
     if "tests" not in there:
         unchecked = sum(not any(covering.values()) for covering in table.values())
