@@ -1,8 +1,8 @@
 """The adapter: how the kit reaches an implementation.
 
 An adapter is any object or module with some of the functions below, NumPy in and NumPy out. Every function is optional:
-what is missing is reported as not offered. Shapes and meanings are those of the reference function of the same name;
-the chapter of the row defines them. Parameters are the flat mapping of canonical names (spec/parameters.py), a state is
+what is missing is reported as not offered. Shapes and meanings are those of the reference function of the same name,
+which its chapter defines. Parameters are the flat mapping of canonical names (spec/parameters.py), a state is
 the training state of [AGT], noise is an argument. Functions named `..._given` are the same without noise: they take the
 samples instead. Functions named `draw_...` sample with a generator of their own, made from a seed. How to write an
 adapter is in docs/adapters.md.
@@ -438,7 +438,7 @@ IMPLEMENTATIONS = ("numpy", "jax", "torch")
 
 
 def load_adapter(backend: str, dtype: str = "float64", device: str | None = None) -> object:
-    """The adapter of one of our columns, computing in `dtype` on `device` (None: the backend's default).
+    """The adapter of one of our implementations, computing in `dtype` on `device` (None: the backend's default).
 
     Raises:
       ValueError: an unknown backend or dtype.

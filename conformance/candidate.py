@@ -81,7 +81,7 @@ def _require_arguments(name: str, function: Any) -> None:
 
 
 def load_candidate(name: str, dtype: str, device: str | None = None) -> object:
-    """The adapter of one of our columns, or a module or file of somebody's own. device: of our columns.
+    """The adapter of one of our implementations, or a module or file of somebody's own. device: of our implementations.
 
     Raises:
       UserError: there is no such thing, or what it needs is not there. A mistake inside of somebody's module keeps its

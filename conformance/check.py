@@ -38,7 +38,7 @@ CHECKS: dict[str, Check] = {}
 def check(
     *requirements: str, uses: Iterable[str], level: int, dtypes: tuple[str, ...] = DTYPES
 ) -> Callable[[Callable[[Setting], Cases]], Callable[[Setting], Cases]]:
-    """Registers a function that builds cases under `row.function_name`. Its docstring says what holds."""
+    """Registers a function that builds cases under `chapter.function_name`. Its docstring says what holds."""
 
     def register(build: Callable[[Setting], Cases]) -> Callable[[Setting], Cases]:
         _register(build, Check(_name(build), requirements, tuple(uses), level, dtypes, _summary(build), cases=build))

@@ -1,4 +1,4 @@
-"""Which checks and tests cover which requirement on which column."""
+"""Which checks and tests cover which requirement in which implementation."""
 
 import ast
 from pathlib import Path
@@ -8,21 +8,21 @@ from conformance.check import CHECKS
 from conformance.execute import missing, selected_checks
 from conformance.requirements import requirements
 
-# Replay and the training loop are rows that belong to no backend. Of the reference's functions the trainer uses
+# Replay and the training loop are chapters that no backend implements. Of the reference's functions the trainer uses
 # `Replay`, `ReplayRatio`, `can_train` and `derive_seed`; what it says itself is covered by the tests.
-SHARED_ROWS = ("REP", "LOOP")
+SHARED_CHAPTERS = ("REP", "LOOP")
 OURS = ("conformance", "impl_jax", "impl_torch", "reference_numpy", "spec")
 TESTS = Path(__file__).resolve().parent.parent / "tests"
 
 
 def coverage() -> tuple[dict[str, dict[str, list[str]]], list[str]]:
-    """Requirement -> column -> names of the checks that cover it there, and what is wrong: uncovered requirements and
-    unknown ids.
+    """Requirement -> implementation -> names of the checks that cover it there, and what is wrong: uncovered
+    requirements and unknown ids.
 
-    The column `tests` holds tests marked with `pytest.mark.covers`: what a whole trainer or learner shows, and no
-    adapter can. Such a requirement needs no check. A backend that is not installed has no column. An installed package
-    comes without tests: then `tests` is no column either, and a requirement without a check is not wrong, as nobody can
-    tell whether a test covers it.
+    The entry `tests` holds tests marked with `pytest.mark.covers`: what a whole trainer or learner shows, and no
+    adapter can. Such a requirement needs no check. A backend that is not installed has no entry. An installed package
+    comes without tests: then there is no entry `tests` either, and a requirement without a check is not wrong, as
+    nobody can tell whether a test covers it.
     """
     selected_checks("float64")
     adapters = installed_adapters()
@@ -30,20 +30,21 @@ def coverage() -> tuple[dict[str, dict[str, list[str]]], list[str]]:
     table: dict[str, dict[str, list[str]]] = {}
     problems = []
     for requirement in requirements():
-        columns = [column for column in adapters if column == "numpy" or requirement.split("-")[0] not in SHARED_ROWS]
+        shared = requirement.split("-")[0] in SHARED_CHAPTERS
         checks = {
-            column: [
+            implementation: [
                 check.name
                 for check in CHECKS.values()
-                if requirement in check.requirements and not missing(adapters[column], check)
+                if requirement in check.requirements and not missing(adapters[implementation], check)
             ]
-            for column in columns
+            for implementation in adapters
+            if implementation == "numpy" or not shared
         }
         table[requirement] = {**checks, **({"tests": tests.get(requirement, [])} if tests else {})}
         if tests and requirement not in tests:
             problems += [
-                f"{requirement}: no check covers it on {column}, and no test"
-                for column, names in checks.items()
+                f"{requirement}: no check covers it in {implementation}, and no test"
+                for implementation, names in checks.items()
                 if not names
             ]
     for check in CHECKS.values():
@@ -59,11 +60,11 @@ def coverage() -> tuple[dict[str, dict[str, list[str]]], list[str]]:
 
 
 def installed_adapters() -> dict[str, object]:
-    """Column -> its adapter, for the columns whose libraries are installed."""
+    """Implementation -> its adapter, for those whose libraries are installed."""
     found = {}
-    for column in IMPLEMENTATIONS:
+    for implementation in IMPLEMENTATIONS:
         try:
-            found[column] = load_adapter(column)
+            found[implementation] = load_adapter(implementation)
         except ModuleNotFoundError as error:
             if error.name is None or error.name.startswith(OURS):
                 raise  # a mistake of ours, and not a library that is not there

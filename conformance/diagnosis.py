@@ -186,8 +186,8 @@ class _Candidate:
 
     def contradicts(self, mutant: Mutant, passing: list[Check]) -> bool:
         """Whether a check that the candidate passes fails on the mutant."""
-        rows = {target.partition(".")[0] for target in mutant.edits}
-        nearest = sorted(passing, key=lambda check: check.name.partition(".")[0] not in rows)
+        chapters = {target.partition(".")[0] for target in mutant.edits}
+        nearest = sorted(passing, key=lambda check: check.name.partition(".")[0] not in chapters)
         return any(self._fails(mutant, check) for check in nearest)
 
     def follows_to_the_end(self, mutant: Mutant, check: Check) -> bool:

@@ -79,7 +79,7 @@ class CheckOptions:
 
 
 @dataclasses.dataclass(frozen=True)
-class Row:
+class RequirementResult:
     """What all checks of one requirement found."""
 
     requirement: str
@@ -162,7 +162,7 @@ def outcome(check: Check, adapter: object, comparisons: Comparisons, body: Calla
     except (Exception, SystemExit) as error:  # an object that the candidate made may call sys.exit
         if isinstance(error, NotImplementedError) and getattr(
             adapter, "refuses_anyhow", False
-        ):  # not of our own columns
+        ):  # not of our own implementations
             return not_implemented(check, comparisons.call.function if comparisons.call else check.name, str(error))
         return result("error", broken, traceback.format_exc(limit=-4))
     if not comparisons.compared:
@@ -197,12 +197,12 @@ def calls_of(checks: Iterable[Check], adapter: object, setting: Setting) -> Iter
                 yield from ((call.function, call.arguments) for call in case.calls if case.refused is None)
 
 
-def rows(results: Iterable[Result]) -> list[Row]:
+def by_requirement(results: Iterable[Result]) -> list[RequirementResult]:
     """The results by requirement, in the order of the chapters; requirements that none of the checks names are left
     out."""
     results = list(results)
     found = [
-        Row(requirement, tuple(result for result in results if requirement in result.check.requirements))
+        RequirementResult(requirement, tuple(result for result in results if requirement in result.check.requirements))
         for requirement in requirements()
     ]
-    return [row for row in found if row.results]
+    return [one for one in found if one.results]

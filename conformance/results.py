@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from conformance.errors import UserError, read_text
-from conformance.execute import FAILING, CheckOptions, Result, Row, rows
+from conformance.execute import FAILING, CheckOptions, RequirementResult, Result, by_requirement
 from conformance.expected import ExpectedFailures
 from conformance.foreign import ForeignAdapter
 from conformance.offered import offered, unchecked
@@ -39,8 +39,8 @@ def versions() -> dict[str, str]:
 
 
 def identity(adapter: object, candidate: str) -> Data:
-    """Name, version, claimed edition and functions of the candidate. One of our own columns has the version of the kit,
-    and claims none."""
+    """Name, version, claimed edition and functions of the candidate. One of our own implementations has the version
+    of the kit, and claims none."""
     if isinstance(adapter, ForeignAdapter):
         claimed = adapter.edition()
         about = {"name": adapter.name, "version": adapter.version, "edition": None if claimed is None else str(claimed)}
@@ -85,7 +85,7 @@ def result_data(
             for name, reason in expected.reasons.items()
         ],
         "checks": {result.check.name: _check(result, options, expected) for result in results},
-        "requirements": {row.requirement: _requirement(row) for row in rows(results)},
+        "requirements": {one.requirement: _requirement(one) for one in by_requirement(results)},
         "diagnoses": [dict(diagnosis) for diagnosis in diagnoses],
     }
 
@@ -129,15 +129,15 @@ def _check(result: Result, options: CheckOptions, expected: ExpectedFailures) ->
     }
 
 
-def _requirement(row: Row) -> Data:
+def _requirement(found: RequirementResult) -> Data:
     return {
-        "status": row.status,
-        "chapter": chapter_of(row.requirement),
-        "text": requirements()[row.requirement],
-        "checks": [result.check.name for result in row.results],
-        "deviation": finite(row.worst.deviation),
-        "share": finite(row.worst.share),
-        "where": row.worst.where,
+        "status": found.status,
+        "chapter": chapter_of(found.requirement),
+        "text": requirements()[found.requirement],
+        "checks": [result.check.name for result in found.results],
+        "deviation": finite(found.worst.deviation),
+        "share": finite(found.worst.share),
+        "where": found.worst.where,
     }
 
 

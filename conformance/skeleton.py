@@ -24,7 +24,7 @@ of a flat action. `params` is a dict from canonical names (`rssm/gru/kernel`) to
 into its own layers first.
 """
 '''
-ROWS = (
+CHAPTERS = (
     *("transforms", "distributions", "layers", "rssm", "networks", "world_model"),
     *("returns", "behavior", "optimizer", "agent", "replay", "training_loop"),
 )
@@ -54,22 +54,22 @@ def skeleton(name: str, short: bool = False) -> str:
         _title("what is not part of the algorithm"),
         *(_commented(hook, getattr(Hooks, hook)) for hook in HOOKS),
     ]
-    rows = functions_by_row()
-    for row, functions in rows.items():
+    chapters = functions_by_chapter()
+    for chapter, functions in chapters.items():
         if chosen := [name for name in functions if name in FIRST or not short]:
             parts += [
-                _title(f"{row.replace('_', ' ')}: spec/{chapter(row)}"),
+                _title(f"{chapter.replace('_', ' ')}: spec/{chapter_file(chapter)}"),
                 *(_commented(name, described(name)) for name in chosen),
             ]
-    return "\n".join([*parts, *([_others(rows)] if short else [])])
+    return "\n".join([*parts, *([_others(chapters)] if short else [])])
 
 
-def _others(rows: Mapping[str, Sequence[str]]) -> str:
+def _others(chapters: Mapping[str, Sequence[str]]) -> str:
     """A comment that names the functions which are not among the FIRST."""
     title = _title("what else can be offered: `conformance new-adapter` without --short describes it")
     lines = (
-        f"{row.replace('_', ' ')}: {', '.join(name for name in functions if name not in FIRST)}"
-        for row, functions in rows.items()
+        f"{chapter.replace('_', ' ')}: {', '.join(name for name in functions if name not in FIRST)}"
+        for chapter, functions in chapters.items()
     )
     wrapped = (
         textwrap.fill(line, 100, initial_indent="# ", subsequent_indent="#   ", break_on_hyphens=False)
@@ -81,24 +81,24 @@ def _others(rows: Mapping[str, Sequence[str]]) -> str:
 HOOKS = tuple(name for name, hook in vars(Hooks).items() if inspect.isfunction(hook) and not name.startswith("_"))
 
 
-def functions_by_row() -> dict[str, list[str]]:
-    """Row of the grid -> its functions of the interface. What the reference lacks belongs to the row of the one
+def functions_by_chapter() -> dict[str, list[str]]:
+    """Chapter -> its functions of the interface. What the reference lacks belongs to the chapter of the function
     before."""
-    modules = {row: importlib.import_module(f"reference_numpy.{row}") for row in ROWS}
-    found: dict[str, list[str]] = {row: [] for row in ROWS}
-    current = ROWS[0]
+    modules = {chapter: importlib.import_module(f"reference_numpy.{chapter}") for chapter in CHAPTERS}
+    found: dict[str, list[str]] = {chapter: [] for chapter in CHAPTERS}
+    current = CHAPTERS[0]
     for name in INTERFACE:
-        current = next((row for row, module in modules.items() if _defined_in(module, name)), current)
+        current = next((chapter for chapter, module in modules.items() if _defined_in(module, name)), current)
         found[current].append(name)
     return found
 
 
-def chapter(row: str) -> str:
-    """The file of a row's chapter."""
+def chapter_file(chapter: str) -> str:
+    """The name of a chapter's file."""
     return next(
         path.name
         for path in resources.files("spec").iterdir()
-        if re.fullmatch(rf"\d\d-{row.replace('_', '-')}\.md", path.name)
+        if re.fullmatch(rf"\d\d-{chapter.replace('_', '-')}\.md", path.name)
     )
 
 
@@ -107,7 +107,7 @@ def described(name: str) -> object:
     function = getattr(Adapter, name)
     if inspect.getdoc(function):
         return function
-    modules = (importlib.import_module(f"reference_numpy.{row}") for row in ROWS)
+    modules = (importlib.import_module(f"reference_numpy.{chapter}") for chapter in CHAPTERS)
     return next(getattr(module, name) for module in modules if _defined_in(module, name))
 
 

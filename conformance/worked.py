@@ -6,8 +6,8 @@ In a check, a case for each example, with the rounding that it allows:
   yield from worked_cases(setting, "returns", "a return with the real constants", bound=64 * setting.u)
 
 The names are those of spec/examples/returns.toml. An example that lists several cases comes as several. What else is to
-be done with them starts from `worked`; without names, all of the row come, in its order. An example of an object has
-`calls` in place of a result:
+be done with them starts from `worked`; without names, it gives all of the chapter, in their order. An example of an
+object has `calls` in place of a result:
 
   for case in worked("training_loop", "no drift"):
       made = script.call(case.function, *case.arguments)
@@ -55,17 +55,17 @@ class Worked:
     calls: tuple["Worked", ...] = ()
 
 
-def worked(row: str, *names: str, profile: str = "paper", dtype: str = "float64") -> tuple[Worked, ...]:
-    """The cases of the named examples of a row, or of all.
+def worked(chapter: str, *names: str, profile: str = "paper", dtype: str = "float64") -> tuple[Worked, ...]:
+    """The cases of the named examples of a chapter, or all of them.
 
     profile: of the hyperparameters that an example does not set; none of them matters. dtype: of the configuration.
 
     Raises:
-      ValueError: the row has no such example; the message lists those that it has.
+      ValueError: the chapter has no such example; the message lists those that it has.
     """
-    known = examples(row)
+    known = examples(chapter)
     if unknown := [name for name in names if name not in known]:
-        raise ValueError(f"{row} has no example {unknown[0]!r}; known: {', '.join(known)}")
+        raise ValueError(f"{chapter} has no example {unknown[0]!r}; known: {', '.join(known)}")
     return tuple(case for name in names or known for case in _cases(known[name], profile, dtype))
 
 
@@ -73,14 +73,14 @@ def worked(row: str, *names: str, profile: str = "paper", dtype: str = "float64"
 WIDE_ARGUMENTS = ("bins", "uniform", "noise", "normal")
 
 
-def worked_cases(setting: Setting, row: str, *names: str, floor: float = 0.0, bound: float = 0.0) -> Cases:
+def worked_cases(setting: Setting, chapter: str, *names: str, floor: float = 0.0, bound: float = 0.0) -> Cases:
     """A case for each case of the named examples. The arguments are rounded to what the candidate can hold, and the
     result is what the reference makes of these, with all its digits: tests compare it with those that are written.
 
     bound: the deviation that is allowed, relative to each number, or to `floor` where the number is smaller; without
     it, results are equal in every bit but the sign of zero.
     """
-    for case in worked(row, *names, profile=setting.profile, dtype=setting.dtype):
+    for case in worked(chapter, *names, profile=setting.profile, dtype=setting.dtype):
         arguments = tuple(map(functools.partial(_held, setting), INTERFACE[case.function], case.arguments))
         expected = getattr(_reference(), case.function)(*copy.deepcopy(arguments))
         where = f"{case.function}, {case.name.partition(': ')[2]}"
@@ -100,7 +100,7 @@ def _held(setting: Setting, name: str, value: Any) -> Any:
 
 
 def _cases(example: Example, profile: str, dtype: str) -> list[Worked]:
-    name = f"{example.row}: {example.name}"
+    name = f"{example.chapter}: {example.name}"
     if example.calls:
         return [_object(example, name)]
     numbered = [name] if len(example.cases) == 1 else [f"{name}, {n}" for n, _ in enumerate(example.cases, 1)]

@@ -1,4 +1,4 @@
-"""Prints the worked numbers of a chapter: spec/examples/<row>.toml as Markdown.
+"""Prints the worked numbers of a chapter: spec/examples/<chapter>.toml as Markdown.
 
 The text of an example has its numbers in braces, by the names of the file: `{discount}`, `{gives[0][2]}`,
 `{gives[mean]}`. Of several cases each name is the list over the cases. Behind a colon stands how to print them:
@@ -49,15 +49,15 @@ def _text(written: Any, digits: str) -> str:
 
 
 def markdown(argument: str) -> str:
-    """The examples of `row`, or those of `row; name; name`, a paragraph or more each.
+    """The examples of `chapter`, or those of `chapter; name; name`, a paragraph or more each.
 
     Raises:
       ValueError: there is no such example, or its text names what it does not have.
     """
-    row, *names = (part.strip() for part in argument.split(";"))
-    known = examples(row)
+    chapter, *names = (part.strip() for part in argument.split(";"))
+    known = examples(chapter)
     if unknown := set(names) - set(known):
-        raise ValueError(f"{row} has no example named {', '.join(sorted(unknown))}; known: {', '.join(known)}")
+        raise ValueError(f"{chapter} has no example named {', '.join(sorted(unknown))}; known: {', '.join(known)}")
     return "\n\n".join(paragraph(known[name]) for name in names or known) + "\n"
 
 
@@ -69,7 +69,7 @@ def paragraph(example: Example) -> str:
         text = example.text.strip().format(**_values(example))
     except (KeyError, IndexError, TypeError) as error:
         raise ValueError(
-            f"{example.row}: {example.name!r}: a placeholder of its text has no number: {error}"
+            f"{example.chapter}: {example.name!r}: a placeholder of its text has no number: {error}"
         ) from error
     blank = "\n" if text.startswith(("|", "-")) else ""
     return f"**{title}** (`{example.function}`, {cited}).\n{blank}{text}"

@@ -8,7 +8,7 @@ A part stands between a marker line and an end line, and is never edited by hand
   <!-- end quote -->
   <!-- table: hyperparameters -->                               one of TABLES, each a table or more
   <!-- end table -->
-  <!-- examples: returns; a return by hand -->              worked numbers of a row, all or by name: docs/examples.py
+  <!-- examples: returns; a return by hand -->              worked numbers of a chapter, some or all: docs/examples.py
   <!-- end examples -->
 """
 

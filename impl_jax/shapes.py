@@ -1,6 +1,6 @@
 """Checks of arguments, and the precisions of a configuration.
 
-An error names the argument, what was expected and what came. The `require` functions are the same in every column.
+An error names the argument, what was expected and what came. All implementations have the same `require` functions.
 Shapes are static: in compiled code the checks cost nothing.
 """
 

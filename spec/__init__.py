@@ -1,4 +1,4 @@
-"""What every column of the grid agrees on: chapters, numbers, configuration, spaces and parameter table."""
+"""What all implementations agree on: chapters, numbers, configuration, spaces and parameter table."""
 
 from spec.config import Config, benchmarks, hyperparameters, load_config, profiles, sizes
 from spec.editions import Difference, Edition, built_profiles, editions, find_edition

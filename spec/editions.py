@@ -31,7 +31,7 @@ class Edition:
 
     title, source, date: which program or text it is. profile: the name of its values.
     differs: requirement id -> what holds instead.
-    beyond: "row.function" of the reference, what the edition has otherwise without a model here.
+    beyond: "chapter.function" of the reference, what the edition has otherwise without a model here.
     """
 
     name: str

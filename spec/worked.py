@@ -1,11 +1,15 @@
-"""The worked numbers of the chapters, where each number stands once: examples/<row>.toml.
+"""The worked numbers of the chapters, where each number stands once: examples/<chapter>.toml.
 
 A file is a list of examples, each a call of one function with numbers that a reader can redo by hand:
 
-  ["a return by hand"] requirements = ["RET-1"] function = "lambda_return"           # of the interface,
-  conformance/adapter.py with.reward = [[9, 1, 0, 2]]         # its arguments, by name with.discount = "1 - 1/333"
-  # a formula, where digits would say less gives = [[2.28125, 1.125, 7]] precision = "exact" text = "The return of state
-  0 is {gives[0][0]}."
+  ["a return by hand"]
+  requirements = ["RET-1"]
+  function = "lambda_return"           # of the interface, conformance/adapter.py
+  with.reward = [[9, 1, 0, 2]]         # its arguments, by name
+  with.discount = "1 - 1/333"          # a formula, where digits would say less
+  gives = [[2.28125, 1.125, 7]]
+  precision = "exact"
+  text = "The return of state 0 is {gives[0][0]}."
 
 `precision` says how near a result must be: "exact", in every bit; "printed", half a unit of the last digit that is
 written (whole numbers and formulas: 1e-12 of the number); a number, relative; or a table of these, for the parts of a
@@ -40,7 +44,7 @@ import numpy as np
 
 from spec.spaces import Discrete, Image, Spaces, Vector
 
-ROWS = (
+CHAPTERS = (
     *("notation", "transforms", "distributions", "layers", "rssm", "networks", "world_model", "returns"),
     *("behavior", "optimizer", "agent", "replay", "training_loop"),
 )
@@ -80,7 +84,7 @@ class Example:
     object, which is made with `arguments`, in their order.
     """
 
-    row: str
+    chapter: str
     name: str
     requirements: tuple[str, ...]
     function: str
@@ -92,22 +96,22 @@ class Example:
 
 
 @functools.cache
-def examples(row: str) -> dict[str, Example]:
-    """The examples of a row by name, in the order of its file.
+def examples(chapter: str) -> dict[str, Example]:
+    """The examples of a chapter by name, in the order of its file.
 
     Raises:
-      ValueError: there is no such row, or an entry cannot be read; the message names it.
+      ValueError: there is no such chapter, or an entry cannot be read; the message names it.
     """
-    if row not in ROWS:
-        raise ValueError(f"unknown row {row!r}; known: {', '.join(ROWS)}")
-    text = resources.files("spec").joinpath("examples", f"{row}.toml").read_text(encoding="utf-8")
-    return {name: read(row, name, entry) for name, entry in tomllib.loads(text, parse_float=Decimal).items()}
+    if chapter not in CHAPTERS:
+        raise ValueError(f"unknown chapter {chapter!r}; known: {', '.join(CHAPTERS)}")
+    text = resources.files("spec").joinpath("examples", f"{chapter}.toml").read_text(encoding="utf-8")
+    return {name: read(chapter, name, entry) for name, entry in tomllib.loads(text, parse_float=Decimal).items()}
 
 
 KEYS = ("requirements", "function", "with", "gives", "cases", "calls", "precision", "text")
 
 
-def read(row: str, name: str, entry: Mapping[str, Any]) -> Example:
+def read(chapter: str, name: str, entry: Mapping[str, Any]) -> Example:
     """One entry of a file.
 
     Raises:
@@ -120,9 +124,9 @@ def read(row: str, name: str, entry: Mapping[str, Any]) -> Example:
         cases = [_case({} if calls else arguments, case, entry["precision"]) for case in several]
         given = {key: _argument(key, value) for key, value in arguments.items()}
     except ValueError as error:
-        raise ValueError(f"spec/examples/{row}.toml: {name!r}: {error}") from error
+        raise ValueError(f"spec/examples/{chapter}.toml: {name!r}: {error}") from error
     requirements, function, text = tuple(entry["requirements"]), entry["function"], entry["text"]
-    return Example(row, name, requirements, function, text, given, arguments, tuple(cases), calls)
+    return Example(chapter, name, requirements, function, text, given, arguments, tuple(cases), calls)
 
 
 def _check_keys(entry: Mapping[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""What is wrong with an argument is checked, and said, in the same way in every column."""
+"""What is wrong with an argument is checked, and said, in the same way in every implementation."""
 
 import ast
 from pathlib import Path
@@ -67,12 +67,12 @@ MISTAKES: list[tuple[str, tuple[Any, ...], str]] = [
 
 @pytest.mark.covers("CON-8")
 @pytest.mark.parametrize(("function", "arguments", "message"), MISTAKES)
-@pytest.mark.parametrize("column", IMPLEMENTATIONS)
-def test_an_error_says_the_same_in_every_column(
-    column: str, function: str, arguments: tuple[Any, ...], message: str
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+def test_an_error_says_the_same_in_every_implementation(
+    implementation: str, function: str, arguments: tuple[Any, ...], message: str
 ) -> None:
     with pytest.raises(ValueError) as error:  # noqa: PT011 - the whole message is compared
-        getattr(load_adapter(column, "float32"), function)(*arguments)
+        getattr(load_adapter(implementation, "float32"), function)(*arguments)
     assert str(error.value).startswith(message)
 
 
@@ -85,7 +85,7 @@ def test_a_message_lists_some_of_many_problems() -> None:
 
 
 @pytest.mark.parametrize("name", SHARED)
-def test_the_checks_are_the_same_code_in_every_column(name: str) -> None:
+def test_the_checks_are_the_same_code_in_every_implementation(name: str) -> None:
     sources = set()
     for package in PACKAGES:
         source = (ROOT / package / "shapes.py").read_text(encoding="utf-8")

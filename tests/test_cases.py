@@ -129,7 +129,7 @@ def test_drawn_values_are_made_smaller() -> None:
 
         yield Drawn(case, n=st.integers(0, 10_000))
 
-    one = Check("row.one", (), ("f",), 0, ("float64",), "", build)
+    one = Check("chapter.one", (), ("f",), 0, ("float64",), "", build)
     result = run_check(one, types.SimpleNamespace(f=lambda n: min(n, 17)), Setting("float64", "paper", examples=50))
     assert result.status == "fail"
     assert result.call is not None

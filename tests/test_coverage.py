@@ -62,7 +62,7 @@ def test_an_installed_package(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
 
 
 def test_a_mistake_of_ours_is_not_a_missing_library(monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(column: str) -> object:
+    def broken(implementation: str) -> object:
         raise ModuleNotFoundError("No module named 'impl_jax.layer'", name="impl_jax.layer")
 
     monkeypatch.setattr(module, "load_adapter", broken)

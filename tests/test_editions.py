@@ -99,8 +99,8 @@ def test_the_data_are_sound() -> None:
             assert difference.like is None or difference.like in MUTANTS
             assert set(difference.settings) <= set(profiles()[edition.profile])
         for target in edition.beyond:
-            row, name = target.split(".")
-            assert hasattr(__import__(f"reference_numpy.{row}", fromlist=[row]), name)
+            chapter, name = target.split(".")
+            assert hasattr(__import__(f"reference_numpy.{chapter}", fromlist=[chapter]), name)
 
 
 def test_every_value_of_a_profile_belongs_to_a_requirement() -> None:

@@ -13,11 +13,11 @@ from conformance.requirements import chapter_of, requirements
 from conformance.worked import Worked, worked
 from docs import examples as pages
 from spec import profiles
-from spec.worked import ROWS, allowed, examples, number, read
+from spec.worked import CHAPTERS, allowed, examples, number, read
 
 ROOT = Path(__file__).resolve().parent.parent
-CASES = [case for row in ROWS for case in worked(row)]
-EXAMPLES = [example for row in ROWS for example in examples(row).values()]
+CASES = [case for chapter in CHAPTERS for case in worked(chapter)]
+EXAMPLES = [example for chapter in CHAPTERS for example in examples(chapter).values()]
 
 
 def agrees(case: Worked, function: Any) -> None:
@@ -42,14 +42,14 @@ def test_the_reference_gives_the_worked_numbers(case: Worked) -> None:
 
 @pytest.mark.parametrize("profile", profiles())
 def test_an_example_sets_every_hyperparameter_that_matters(profile: str) -> None:
-    for case in (case for row in ROWS for case in worked(row, profile=profile) if not case.calls):
+    for case in (case for chapter in CHAPTERS for case in worked(chapter, profile=profile) if not case.calls):
         agrees(case, getattr(load_adapter("numpy"), case.function))
 
 
 def test_an_unknown_name_is_answered_with_the_known_ones() -> None:
     with pytest.raises(ValueError, match=r"no example 'a retrun'; known: a return by hand, "):
         worked("returns", "a retrun")
-    with pytest.raises(ValueError, match=r"unknown row 'return'; known: .*returns"):
+    with pytest.raises(ValueError, match=r"unknown chapter 'return'; known: .*returns"):
         worked("return")
 
 
@@ -93,7 +93,7 @@ def test_a_wrong_entry_is_named(change: dict[str, Any], message: str) -> None:
         read("transforms", "an example", {key: value for key, value in entry.items() if value is not None})
 
 
-@pytest.mark.parametrize("example", EXAMPLES, ids=[f"{example.row}: {example.name}" for example in EXAMPLES])
+@pytest.mark.parametrize("example", EXAMPLES, ids=[f"{example.chapter}: {example.name}" for example in EXAMPLES])
 def test_an_example_stands_in_its_chapter(example: Any) -> None:
     """It names a function of the interface and requirements that there are, and its chapter prints it once."""
     assert example.function in INTERFACE

@@ -37,9 +37,14 @@ def outputs(seed: int = 0) -> dict[str, dict[str, np.ndarray]]:
     return {"arm": arm, "buttons": {"logits": rng.integers(-1, 2, (ROWS, 5)).astype(float)}}  # with many ties
 
 
-def mode_by(column: str, raw: dict[str, dict[str, np.ndarray]]) -> np.ndarray:
-    convert = {"numpy": np.asarray, "jax": jnp.asarray, "torch": lambda x: torch.tensor(x, dtype=torch.float32)}[column]
-    module: Any = {"numpy": behavior, "jax": impl_jax.behavior, "torch": impl_torch.behavior}[column]
+def mode_by(implementation: str, raw: dict[str, dict[str, np.ndarray]]) -> np.ndarray:
+    convert: Any
+    module: Any
+    convert, module = {
+        "numpy": (np.asarray, behavior),
+        "jax": (jnp.asarray, impl_jax.behavior),
+        "torch": (lambda x: torch.tensor(x, dtype=torch.float32), impl_torch.behavior),
+    }[implementation]
     return np.asarray(
         module.mode_action(
             {key: {name: convert(x) for name, x in part.items()} for key, part in raw.items()}, TASK, CONFIG
@@ -48,10 +53,10 @@ def mode_by(column: str, raw: dict[str, dict[str, np.ndarray]]) -> np.ndarray:
 
 
 @pytest.mark.covers("LOOP-71")
-@pytest.mark.parametrize("column", ["numpy", "jax", "torch"])
-def test_the_mode_is_the_mean_and_the_first_most_probable_class(column: str) -> None:
+@pytest.mark.parametrize("implementation", ["numpy", "jax", "torch"])
+def test_the_mode_is_the_mean_and_the_first_most_probable_class(implementation: str) -> None:
     raw = outputs()
-    action = mode_by(column, raw)
+    action = mode_by(implementation, raw)
     silent = behavior.sample_action(raw, np.zeros((ROWS, TASK.action_noise_size)), TASK, CONFIG)
     np.testing.assert_allclose(action[:, :2], silent[:, :2], rtol=1e-5, atol=1e-6)  # the sample at noise 0
     logits = raw["buttons"]["logits"]

@@ -277,7 +277,7 @@ def test_what_is_not_implemented_is_not_offered() -> None:
     assert found == {"networks.brightness_literals", "networks.encoder_with_other_convolutions_matches"}
 
 
-def test_our_own_columns_have_no_such_excuse(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_our_own_implementations_have_no_such_excuse(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(PoolsOnly, "refuses_anyhow", False)
     assert run("networks.encoder_matches", PoolsOnly()).status == "error"
 

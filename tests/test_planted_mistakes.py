@@ -24,8 +24,8 @@ from reference_numpy import layers
 
 CHECKS = selected_checks("float64")
 NARROW_CHECKS = {check.name: check for check in selected_checks("bfloat16")}
-ROWS = ("transforms", "distributions", "layers", "rssm", "networks", "world_model", "returns", "behavior", "optimizer",
-        "agent", "replay", "training_loop")  # fmt: skip
+CHAPTERS = ("transforms", "distributions", "layers", "rssm", "networks", "world_model", "returns", "behavior",
+            "optimizer", "agent", "replay", "training_loop")  # fmt: skip
 
 reach = functools.cache(lambda: sound(CHECKS)[0])
 
@@ -41,7 +41,7 @@ def test_the_mistake_is_caught(name: str) -> None:
 def test_the_catalogue_is_complete() -> None:
     assert len(MUTANTS) >= 70
     modules = [f"{target.partition('.')[0]}" for mutant in MUTANTS.values() for target in mutant.edits]
-    assert set(modules) == set(ROWS)
+    assert set(modules) == set(CHAPTERS)
     for mutant in MUTANTS.values():
         assert mutant.explanation, mutant.name
         assert mutant.provenance, mutant.name
@@ -103,7 +103,7 @@ def test_broken_checks_catch_nothing(
         yield judged("silu", (np.ones(1),), lambda c, result: c.holds("a number", result[0] > 0))
 
     builders = (deviates, raises, right, literal, index)
-    checks = [Check(f"row.{build.__name__}", (), ("silu",), 0, ("float64",), "", build) for build in builders]
+    checks = [Check(f"chapter.{build.__name__}", (), ("silu",), 0, ("float64",), "", build) for build in builders]
     planted = {
         "harmless": silu_mutant("harmless", "(x / (1.0 + np.exp(-x)))"),
         "scalar": silu_mutant("scalar", "np.float64(0.5)"),
@@ -114,12 +114,12 @@ def test_broken_checks_catch_nothing(
     report = json.loads((tmp_path / "mutants.json").read_text(encoding="utf-8"))["mutants"]
     assert {name: (entry["deviates_in"], entry["raises_in"]) for name, entry in report.items()} == {
         "harmless": ([], []),
-        "scalar": (["row.literal"], ["row.index"]),
+        "scalar": (["chapter.literal"], ["chapter.index"]),
     }
     assert report["scalar"]["chapter"] == "spec/03-layers.md"
     out = capsys.readouterr().out
-    assert "row.deviates is not counted" in out
-    assert "row.raises is not counted" in out
+    assert "chapter.deviates is not counted" in out
+    assert "chapter.raises is not counted" in out
     assert "2 mutants, 1 survived; 3 checks, 2 more" in out
 
 

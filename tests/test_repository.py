@@ -15,11 +15,11 @@ from conformance.requirements import requirements
 from docs.render import stale
 
 ROOT = Path(__file__).resolve().parent.parent
-ROWS = [
+CHAPTERS = [
     *("transforms", "distributions", "layers", "rssm", "networks", "world_model"),
     *("returns", "behavior", "optimizer", "agent"),
 ]
-SHARED_ROWS = ["replay", "training_loop"]
+SHARED_CHAPTERS = ["replay", "training_loop"]
 MAY_IMPORT = {
     "spec": set(),
     "reference_numpy": {"spec"},
@@ -31,23 +31,23 @@ MAY_IMPORT = {
 ADAPTERS = {"jax_adapter.py": "impl_jax", "torch_adapter.py": "impl_torch"}
 
 
-def public_functions(row: str) -> list[tuple[str, object]]:
-    module = importlib.import_module(f"reference_numpy.{row}")
+def public_functions(chapter: str) -> list[tuple[str, object]]:
+    module = importlib.import_module(f"reference_numpy.{chapter}")
     members = inspect.getmembers(module, lambda member: inspect.isfunction(member) or inspect.isclass(member))
     return [
         (name, member) for name, member in members if member.__module__ == module.__name__ and not name.startswith("_")
     ]
 
 
-@pytest.mark.parametrize("row", [*ROWS, *SHARED_ROWS, "stop_gradient"])
-def test_every_public_function_of_the_reference_cites_its_requirements(row: str) -> None:
-    functions = public_functions(row)
+@pytest.mark.parametrize("chapter", [*CHAPTERS, *SHARED_CHAPTERS, "stop_gradient"])
+def test_every_public_function_of_the_reference_cites_its_requirements(chapter: str) -> None:
+    functions = public_functions(chapter)
     assert functions
     for name, function in functions:
         cited = set(re.findall(r"\[([A-Z]{2,6}-\d+)\]", inspect.getdoc(function) or ""))
-        assert cited, f"{row}.{name} cites no requirement"
+        assert cited, f"{chapter}.{name} cites no requirement"
         assert cited <= set(requirements()), (
-            f"{row}.{name} cites {sorted(cited - set(requirements()))}, which no chapter has"
+            f"{chapter}.{name} cites {sorted(cited - set(requirements()))}, which no chapter has"
         )
 
 
@@ -82,11 +82,11 @@ def test_cited_decisions_exist() -> None:
         assert cited <= known, f"{path.name} cites {sorted(cited - known)}"
 
 
-@pytest.mark.parametrize("row", ROWS)
-def test_the_grid_shows_in_the_folders(row: str) -> None:
-    assert [path.name for path in (ROOT / "spec").glob(f"*-{row.replace('_', '-')}.md")]
-    for column in ("reference_numpy", "impl_jax", "impl_torch", "conformance/cases"):
-        assert (ROOT / column / f"{row}.py").exists(), f"{column} lacks the row {row}"
+@pytest.mark.parametrize("chapter", CHAPTERS)
+def test_the_grid_shows_in_the_folders(chapter: str) -> None:
+    assert [path.name for path in (ROOT / "spec").glob(f"*-{chapter.replace('_', '-')}.md")]
+    for implementation in ("reference_numpy", "impl_jax", "impl_torch", "conformance/cases"):
+        assert (ROOT / implementation / f"{chapter}.py").exists(), f"{implementation} lacks the chapter {chapter}"
 
 
 def imported_packages(path: Path) -> set[str]:

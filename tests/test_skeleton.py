@@ -12,7 +12,7 @@ from conformance.case import Setting
 from conformance.cli import main
 from conformance.execute import run_check, selected_checks
 from conformance.problems import small_config
-from conformance.skeleton import FIRST, HOOKS, functions_by_row, skeleton
+from conformance.skeleton import FIRST, HOOKS, functions_by_chapter, skeleton
 from spec import Config
 
 
@@ -77,12 +77,12 @@ def test_the_skeleton_names_what_a_function_reads_of_the_configuration(monkeypat
 
 
 def test_the_skeleton_is_grouped_by_chapter() -> None:
-    rows = functions_by_row()
-    assert [name for functions in rows.values() for name in functions] == list(INTERFACE)
-    assert rows["returns"][0] == "lambda_return"
-    assert rows["rssm"][-2:] == ["observe_given", "imagine_given"]
-    assert {"gradients", "train_step_given", "draw_parameters"} < set(rows["agent"])
-    assert rows["training_loop"][-1] == "derive_seed"
+    chapters = functions_by_chapter()
+    assert [name for functions in chapters.values() for name in functions] == list(INTERFACE)
+    assert chapters["returns"][0] == "lambda_return"
+    assert chapters["rssm"][-2:] == ["observe_given", "imagine_given"]
+    assert {"gradients", "train_step_given", "draw_parameters"} < set(chapters["agent"])
+    assert chapters["training_loop"][-1] == "derive_seed"
     assert "# --- returns: spec/07-returns.md ---" in skeleton("mine.py")
 
 

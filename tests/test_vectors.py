@@ -80,17 +80,17 @@ def test_the_document_is_enough_to_read_the_set() -> None:
 
 
 @pytest.mark.parametrize(
-    ("right", "mistake", "row"),
+    ("right", "mistake", "chapter"),
     [
         ("np.log1p(np.abs(x))", "np.log1p(np.abs(np.float32(x)))", "transforms"),
         ("value[:, t] + lambda_", "value[:, t - 1] + lambda_", "returns"),
         ("np.searchsorted(bins, x)", "np.searchsorted(bins, x) - 1", "transforms"),
     ],
 )
-def test_the_reader_notices_mistakes(right: str, mistake: str, row: str) -> None:
+def test_the_reader_notices_mistakes(right: str, mistake: str, chapter: str) -> None:
     names = reader((right, mistake))[1]
     assert names
-    assert {name.partition(".")[0] for name in names} == {row}
+    assert {name.partition(".")[0] for name in names} == {chapter}
 
 
 def test_the_reference_is_right() -> None:
@@ -113,7 +113,7 @@ def test_automatic_differentiation_gives_the_gradients() -> None:
     for case in CASES:
         name = case.entry["function"]
         for gradient in case.entry.get("gradients", ()):
-            function = next(getattr(row, name) for row in (distributions, world_model, behavior) if hasattr(row, name))
+            function = next(getattr(one, name) for one in (distributions, world_model, behavior) if hasattr(one, name))
             for dtype, tolerance in gradient["tolerance"].items():
                 result, leaf = differentiable(case, function, gradient["by"], dtype)
                 for key in gradient["of"]:

@@ -1,2 +1,2 @@
-"""The adapters of our own columns. Each is imported only when it is asked for, so that no backend is needed for
+"""The adapters of our own implementations. Each is imported only when it is asked for, so that no backend is needed for
 another."""

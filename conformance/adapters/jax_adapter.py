@@ -17,9 +17,9 @@ from impl_jax import agent, behavior, distributions, layers, networks, optimizer
 from impl_jax.learner import select_device
 from spec import Config, Spaces
 
-ROWS = (transforms, distributions, layers, rssm, networks, world_model, returns, behavior, optimizer, agent)
-# Functions of layers whose first array is not of the compute dtype; other rows take float32 or better and convert it
-# themselves.
+CHAPTERS = (transforms, distributions, layers, rssm, networks, world_model, returns, behavior, optimizer, agent)
+# Functions of layers whose first array is not of the compute dtype; other chapters take float32 or better and convert
+# it themselves.
 EXACT = ("truncated_normal", "dense", "mlp")
 # Small calls take less time than optimizing them. Options of XLA come and go with its versions.
 QUICK = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
@@ -36,14 +36,14 @@ class JaxAdapter:
         self.compiler_options: dict[str, Any] | None = None
 
     def __getattr__(self, name: str) -> Any:
-        for row in ROWS:
-            function = vars(row).get(name)
+        for chapter in CHAPTERS:
+            function = vars(chapter).get(name)
             if (
                 function is not None
                 and not name.startswith("_")
-                and getattr(function, "__module__", None) == row.__name__
+                and getattr(function, "__module__", None) == chapter.__name__
             ):
-                first = jnp.bfloat16 if self.dtype == "bfloat16" and row is layers and name not in EXACT else None
+                first = jnp.bfloat16 if self.dtype == "bfloat16" and chapter is layers and name not in EXACT else None
                 return functools.partial(self._run, function, name, first)
         raise AttributeError(name)
 

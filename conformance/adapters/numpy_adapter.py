@@ -20,7 +20,7 @@ from reference_numpy import (
     world_model,
 )
 
-ROWS = (
+CHAPTERS = (
     transforms,
     distributions,
     layers,
@@ -47,9 +47,9 @@ class NumpyAdapter(WithoutNoise):
     def __getattr__(self, name: str) -> Any:
         if name in ("gradients", "train_step"):
             raise AttributeError(f"the reference has no automatic differentiation, so it cannot offer {name}")
-        for row in ROWS:
-            if not name.startswith("_") and name in vars(row):
-                return getattr(row, name)
+        for chapter in CHAPTERS:
+            if not name.startswith("_") and name in vars(chapter):
+                return getattr(chapter, name)
         raise AttributeError(name)
 
     def imagine(self, params: Any, carry: Any, action: np.ndarray, uniform: np.ndarray, config: Any) -> Any:

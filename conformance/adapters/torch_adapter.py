@@ -24,7 +24,7 @@ from impl_torch.learner import select_device
 from impl_torch.shapes import DTYPES
 from spec import Config
 
-ROWS = (transforms, distributions, layers, rssm, networks, world_model, returns, behavior, optimizer, agent)
+CHAPTERS = (transforms, distributions, layers, rssm, networks, world_model, returns, behavior, optimizer, agent)
 ARRAYS = (torch.Tensor, transforms.Bins)
 # What has no configuration to say in which precision it computes takes it from its first argument.
 NARROW = (layers,)
@@ -42,10 +42,10 @@ class TorchAdapter:
             torch.backends.cudnn.allow_tf32 = False
 
     def __getattr__(self, name: str) -> Any:
-        for row in ROWS:
-            function: Any = vars(row).get(name)
-            if not name.startswith("_") and getattr(function, "__module__", None) == row.__name__:
-                return self._wrap(function, narrow=row in NARROW and name != "truncated_normal")
+        for chapter in CHAPTERS:
+            function: Any = vars(chapter).get(name)
+            if not name.startswith("_") and getattr(function, "__module__", None) == chapter.__name__:
+                return self._wrap(function, narrow=chapter in NARROW and name != "truncated_normal")
         raise AttributeError(name)
 
     def imagine(self, params: Any, carry: Any, action: np.ndarray, uniform: np.ndarray, config: Config) -> Any:

@@ -1,4 +1,4 @@
-"""The checks, one module for each row of the grid. Importing this package registers all of them."""
+"""The checks, one module for each chapter. Importing this package registers all of them."""
 
 from conformance.cases import (
     agent,

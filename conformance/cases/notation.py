@@ -1,5 +1,5 @@
-"""Checks of spec/00-notation.md: conventions that every row shares. Most of them are also seen by the checks of the
-rows themselves."""
+"""Checks of spec/00-notation.md: conventions that every chapter shares. Most of them are also seen by the checks
+of the other chapters."""
 
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any

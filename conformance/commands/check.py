@@ -19,7 +19,7 @@ from conformance.reports import badge, html, junit, markdown, terminal
 from conformance.results import Data, identity, result_data, write, write_text
 from spec import editions, find_edition
 
-# of our own columns, unless another is given: they follow the configuration, so there is nothing to find out
+# of our own implementations, unless another is given: they follow the configuration, so there is nothing to find out
 OUR_EDITION = "paper"
 RENDERED: dict[str, Callable[[Data], str]] = {
     "markdown": markdown.render,

@@ -1,4 +1,4 @@
-"""Mutants: the reference with one realistic mistake each, one module for every row of the grid.
+"""Mutants: the reference with one realistic mistake each, one module for every chapter.
 
 A check that catches no mutant checks nothing, and a candidate that behaves like a mutant probably has its mistake.
 """
@@ -22,7 +22,7 @@ from conformance.mutants.trial import relevant, sound, trial
 
 __all__ = ["MUTANTS", "Mutant", "MutantAdapter", "PlantedAdapter", "planted", "relevant", "sound", "trial"]
 
-_ROWS = (
+_CHAPTERS = (
     transforms,
     distributions,
     layers,
@@ -37,4 +37,4 @@ _ROWS = (
     training_loop,
 )
 
-MUTANTS: dict[str, Mutant] = {mutant.name: mutant for row in _ROWS for mutant in row.MUTANTS}
+MUTANTS: dict[str, Mutant] = {mutant.name: mutant for chapter in _CHAPTERS for mutant in chapter.MUTANTS}

@@ -26,7 +26,7 @@ class Mutant:
 
     name: what it is called. explanation: what the wrong code does. provenance: who made the mistake, or where it
     stands. violates: requirement ids, the chapter of the first is the mutant's. fix: what to do about it. edits:
-    "row.function" or "row.Class" of the reference -> {right: wrong}, each text once in the source.
+    "chapter.function" or "chapter.Class" of the reference -> {right: wrong}, each text once in the source.
     """
 
     name: str
@@ -42,7 +42,7 @@ class Mutant:
 
     @functools.cached_property
     def replacements(self) -> Replacements:
-        """The wrong functions and classes, by "row.name".
+        """The wrong functions and classes, by "chapter.name".
 
         Raises:
           ValueError: the reference has no such text, or more than once.
@@ -51,8 +51,8 @@ class Mutant:
 
 
 def _edited(mutant: str, target: str, edits: Mapping[str, str]) -> Callable[..., Any]:
-    row, name = target.split(".")
-    module = importlib.import_module(f"reference_numpy.{row}")
+    chapter, name = target.split(".")
+    module = importlib.import_module(f"reference_numpy.{chapter}")
     source = inspect.getsource(getattr(module, name))
     for right, wrong in edits.items():
         if source.count(right) != 1:
@@ -69,12 +69,12 @@ def _edited(mutant: str, target: str, edits: Mapping[str, str]) -> Callable[...,
 def planted(replacements: Replacements) -> Iterator[None]:
     """While this context lasts, the reference uses the wrong functions, wherever it had imported the right ones."""
     undo: list[tuple[Any, str, Any]] = []
-    rows = [module for name, module in list(sys.modules.items()) if name.startswith("reference_numpy")]
+    modules = [module for name, module in list(sys.modules.items()) if name.startswith("reference_numpy")]
     try:
         for target, replacement in replacements.items():
-            row, name = target.split(".")
-            original = getattr(importlib.import_module(f"reference_numpy.{row}"), name)
-            for module in rows:
+            chapter, name = target.split(".")
+            original = getattr(importlib.import_module(f"reference_numpy.{chapter}"), name)
+            for module in modules:
                 if vars(module).get(name) is original:
                     undo.append((module, name, original))
                     setattr(module, name, replacement)

@@ -19,7 +19,7 @@ Reach = Mapping[Check, frozenset[str]]
 @contextlib.contextmanager
 def tracing(entered: set[str]) -> Iterator[None]:
     """While this context lasts, the functions and classes of the reference that are entered are added, as
-    "row.name"."""
+    "chapter.name"."""
 
     def note(frame: FrameType, event: str, argument: Any) -> None:
         module = frame.f_globals.get("__name__", "")

@@ -1,4 +1,4 @@
-"""The result as JUnit XML, which CI services show: a test suite for each row of the grid, a test case for each
+"""The result as JUnit XML, which CI services show: a test suite for each chapter, a test case for each
 check."""
 
 import re
@@ -14,12 +14,12 @@ def render(data: Data) -> str:
     """Expected failures are skipped, and what is not judged. What else stands against the run is a failure in the suite
     `verdict`."""
     suites = ElementTree.Element("testsuites", name=_text(f"conformance of {summary.label(data)}"))
-    by_row: dict[str, list[ElementTree.Element]] = {}
+    by_chapter: dict[str, list[ElementTree.Element]] = {}
     for name, check in data["checks"].items():
-        row, _, title = name.partition(".")
-        by_row.setdefault(row, []).append(_case(data, row, title, check))
-    by_row["verdict"] = [_verdict(data)]
-    for row, cases in by_row.items():
+        chapter, _, title = name.partition(".")
+        by_chapter.setdefault(chapter, []).append(_case(data, chapter, title, check))
+    by_chapter["verdict"] = [_verdict(data)]
+    for chapter, cases in by_chapter.items():
         kinds = {
             kind: str(sum(case.find(kind) is not None for case in cases)) for kind in ("failure", "error", "skipped")
         }
@@ -29,7 +29,7 @@ def render(data: Data) -> str:
             "errors": kinds["error"],
             "skipped": kinds["skipped"],
         }
-        suite = ElementTree.SubElement(suites, "testsuite", {"name": _text(row), **counts})
+        suite = ElementTree.SubElement(suites, "testsuite", {"name": _text(chapter), **counts})
         _properties(suite, data)
         suite.extend(cases)
     ElementTree.indent(suites)
@@ -49,8 +49,8 @@ def _properties(suite: ElementTree.Element, data: Data) -> None:
         ElementTree.SubElement(properties, "property", name=_text(f"version of {name}"), value=_text(version))
 
 
-def _case(data: Data, row: str, title: str, check: Data) -> ElementTree.Element:
-    case = ElementTree.Element("testcase", classname=_text(f"conformance.{row}"), name=_text(title))
+def _case(data: Data, chapter: str, title: str, check: Data) -> ElementTree.Element:
+    case = ElementTree.Element("testcase", classname=_text(f"conformance.{chapter}"), name=_text(title))
     message = _text(check["message"].strip())
     first = message.splitlines()[-1] if check["status"] == "error" and message else message.partition("\n")[0]
     if check["status"] in ("not offered", "not in edition"):
@@ -60,7 +60,7 @@ def _case(data: Data, row: str, title: str, check: Data) -> ElementTree.Element:
     elif check["status"] in summary.FAILING:
         kind = "failure" if check["status"] == "fail" else "error"
         failed = ElementTree.SubElement(case, kind, message=first, type=", ".join(map(_text, check["requirements"])))
-        failed.text = _text(_details(data, f"{row}.{title}", check))
+        failed.text = _text(_details(data, f"{chapter}.{title}", check))
     return case
 
 

@@ -71,7 +71,7 @@ def gradients(vector: Vector) -> list[Gradient]:
 
 def _derivatives(vector: Vector, place: int, argument: np.ndarray, steps: np.ndarray) -> list[np.ndarray | None]:
     """For each output; None where the error is too large."""
-    module = next(row for row in (distributions, world_model, behavior) if hasattr(row, vector.function))
+    module = next(one for one in (distributions, world_model, behavior) if hasattr(one, vector.function))
     function = getattr(module, vector.function)
 
     def sums(moved: np.ndarray) -> np.ndarray:

@@ -72,9 +72,9 @@ def write_vectors(
     files: dict[str, bytes] = {}
     names: dict[str, list[str]] = {}
     left_out: list[dict[str, Any]] = []
-    for row in sorted({_row(check) for check in checks}):
+    for chapter in sorted({_chapter(check) for check in checks}):
         table, cases = Table(), []
-        for check in (check for check in checks if _row(check) == row):
+        for check in (check for check in checks if _chapter(check) == chapter):
             progress(check.name)
             recorded = record(check, profile, seed, SETS[size].examples)
             vectors = list(selected(recorded, SETS[size]))
@@ -85,11 +85,11 @@ def write_vectors(
                     {"check": check.name, "requirements": list(check.requirements), "what": check.summary, "why": why}
                 )
         if cases:
-            files[f"{row}.json"], files[f"{row}.npz"] = (
+            files[f"{chapter}.json"], files[f"{chapter}.npz"] = (
                 to_json({"objects": table.objects, "cases": cases}),
                 to_npz(table.arrays),
             )
-            names[f"{row}.json"] = [case["name"] for case in cases]
+            names[f"{chapter}.json"] = [case["name"] for case in cases]
     index = {
         "format": FORMAT,
         "package": package_version(),
@@ -137,8 +137,8 @@ def selected(vectors: Iterable[Vector], size: Size) -> Iterator[Vector]:
 
 
 def describe_case(vector: Vector, table: Table) -> dict[str, Any] | None:
-    """The entry of a vector in the JSON file of its row, its arrays in the table; None if it has an argument that JSON
-    cannot write."""
+    """The entry of a vector in the JSON file of its chapter, its arrays in the table; None if it has an argument that
+    JSON cannot write."""
     check = vector.check
     try:
         arguments = {
@@ -221,7 +221,7 @@ def _named_in_index(directory: Path) -> set[str]:
         return set()
 
 
-def _row(check: Check) -> str:
+def _chapter(check: Check) -> str:
     return check.name.partition(".")[0]
 
 
