@@ -2,9 +2,12 @@
 
 import functools
 import re
+from collections.abc import Collection
 from importlib import resources
 
 _REQUIREMENT = re.compile(r"^- \*\*\[([A-Z]{2,6}-\d+)\]\*\* (.*(?:\n  .*)*)$", re.MULTILINE)
+MANY = 10
+"""A check of so many requirements judges them jointly: it says little of each."""
 
 
 @functools.cache
@@ -37,3 +40,9 @@ def chapter_of(requirement: str) -> str:
         if re.match(r"\d\d-.*\.md$", path.name) and f"- **[{requirement}]** " in path.read_text(encoding="utf-8"):
             return f"spec/{path.name}"
     raise ValueError(f"no chapter has the requirement {requirement}")
+
+
+def check_label(name: str, covered: Collection[str]) -> str:
+    """The name of a check where it is listed for one of the requirements that it covers: losses.actor_matches (jointly
+    with 11 others), if they are MANY."""
+    return f"{name} (jointly with {len(covered) - 1} others)" if len(covered) >= MANY else name

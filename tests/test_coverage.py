@@ -68,3 +68,13 @@ def test_a_mistake_of_ours_is_not_a_missing_library(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(module, "load_adapter", broken)
     with pytest.raises(ModuleNotFoundError):
         module.installed_adapters()
+
+
+def test_the_checks_of_a_requirement_are_listed(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "800")
+    assert main(["coverage"]) == 0
+    out = capsys.readouterr().out
+    assert "losses.return_range_matches (jointly with 11 others)" in out
+    assert "│ distributions.normal_literals, distributions.normal_matches " in out

@@ -1,5 +1,6 @@
 """Reports: one result, rendered in many ways, and what hostile text cannot do."""
 
+import copy
 import io
 import json
 import re
@@ -19,7 +20,7 @@ from conformance.execute import run_check
 from conformance.offered import offered, unchecked
 from conformance.pages import prose, tex
 from conformance.reports import badge, html, junit, markdown, summary, terminal
-from conformance.requirements import requirements
+from conformance.requirements import check_label, requirements
 
 
 @pytest.fixture(scope="module")
@@ -95,6 +96,19 @@ def test_markdown(data: dict[str, Any]) -> None:
     assert f"```python\n{data['checks'][FAIL]['failure']['snippet']}\n```" in text
     assert "| `reward` | float64 \\[1, 4\\] | `[[9.0, 1.0, 0.0, 2.0]]` |" in text
     assert "07 Returns (`spec/07-returns.md`)" in text
+
+
+def test_a_check_of_ten_requirements_judges_them_jointly(data: dict[str, Any]) -> None:
+    ids = [f"RET-{n}" for n in range(1, 15)]
+    assert check_label("losses.actor_matches", ids) == "losses.actor_matches (jointly with 13 others)"
+    assert check_label("losses.actor_matches", ids[:10]) == "losses.actor_matches (jointly with 9 others)"
+    assert check_label("losses.actor_matches", ids[:9]) == "losses.actor_matches"
+    joint = copy.deepcopy(data)
+    joint["checks"][FAIL]["requirements"] = ids
+    for shown_there in (markdown.render(joint), Document(html.render([joint, joint])).text):
+        assert "returns.lambda_return_literals (jointly with 13 others)" in shown_there
+    line = "| RET-1 | fail | `returns.lambda_return_literals (jointly with 13 others)` |"
+    assert line in markdown.render(joint).splitlines()
 
 
 def test_junit(data: dict[str, Any]) -> None:

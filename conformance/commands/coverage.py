@@ -4,11 +4,13 @@ import argparse
 import textwrap
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from conformance.adapter import IMPLEMENTATIONS
+from conformance.check import CHECKS
 from conformance.coverage import coverage
-from conformance.requirements import requirements
+from conformance.requirements import check_label, requirements
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -25,7 +27,9 @@ def main(console: Console, options: argparse.Namespace) -> int:
     for requirement, covering in table.items():
         counts = (str(len(covering[column])) if column in covering else "-" for column in columns)
         text = textwrap.shorten(requirements()[requirement], 80, placeholder=" ...")
-        view.add_row(requirement, *counts, text.replace("[", r"\["))
+        names = dict.fromkeys(name for column in IMPLEMENTATIONS for name in covering.get(column, ()))
+        labels = [check_label(name, CHECKS[name].requirements) for name in names]
+        view.add_row(requirement, *counts, escape("\n".join(filter(None, [text, ", ".join(labels)]))))
     console.print(view)
     for problem in problems:
         console.print(f"[bold red]{problem}")

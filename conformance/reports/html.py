@@ -29,10 +29,12 @@ class Cell:
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """A requirement, with a cell for each result. is_offered: whether some result has found anything."""
+    """A requirement, with a cell for each result. checks: those that cover it. is_offered: whether some result has
+    found anything."""
 
     name: str
     text: str
+    checks: list[str]
     cells: list[Cell]
     is_offered: bool
 
@@ -83,8 +85,9 @@ def _chapter(results: Sequence[Data], path: str, found: Sequence[summary.Chapter
 
 def _row(results: Sequence[Data], name: str) -> Row:
     text = next(data["requirements"][name]["text"] for data in results if name in data["requirements"])
+    checks = dict.fromkeys(check for data in results for check in summary.checks_of(data, name))
     cells = [_requirement_cell(data, name) for data in results]
-    return Row(name, text, cells, any(cell.words not in ("", "not offered") for cell in cells))
+    return Row(name, text, list(checks), cells, any(cell.words not in ("", "not offered") for cell in cells))
 
 
 def _chapter_cell(chapter: summary.Chapter | None) -> Cell:

@@ -15,6 +15,7 @@ def render(data: Data) -> str:
         text(" ".join([*summary.edition(data), *summary.unchecked(data)])),
         _chapters(data),
         *_diagnoses(data),
+        *_requirements(data),
         *_failures("Failures", summary.failures(data).ordinary),
         *_failures("Only with extreme input", summary.failures(data).extreme),
         *_expected(data),
@@ -72,6 +73,17 @@ def _diagnoses(data: Data) -> list[str]:
         for found in data["diagnoses"]
     ]
     return ["## It behaves like", "\n".join(lines)] if lines else []
+
+
+def _requirements(data: Data) -> list[str]:
+    """Those that failed, with the checks that say so."""
+    failing = (*summary.FAILING, summary.EXTREME)
+    rows = [
+        [text(name), summary.status(data, name), ", ".join(map(code, summary.checks_of(data, name, failing)))]
+        for name in data["requirements"]
+        if summary.status(data, name) in failing
+    ]
+    return ["## Requirements that fail", table(["requirement", "status", "failing checks"], rows)] if rows else []
 
 
 def _expected(data: Data) -> list[str]:

@@ -5,11 +5,12 @@ import functools
 import importlib.metadata
 import itertools
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from importlib import resources
 from typing import Any
 
 from conformance.execute import NOT_IMPLEMENTED
+from conformance.requirements import check_label
 from spec import editions
 
 Data = Mapping[str, Any]
@@ -249,6 +250,13 @@ def chapters_of(data: Data, check: Data) -> list[str]:
     """The paths of the chapters whose requirements a check covers."""
     known = data["requirements"]
     return sorted({known[name]["chapter"] for name in check["requirements"] if name in known})
+
+
+def checks_of(data: Data, requirement: str, statuses: Collection[str] = STATUSES) -> list[str]:
+    """The checks of a requirement that were run and came to one of these statuses, each with its label."""
+    names = data["requirements"].get(requirement, {"checks": []})["checks"]
+    found = {name: data["checks"][name] for name in names if name in data["checks"]}
+    return [check_label(name, check["requirements"]) for name, check in found.items() if told(check) in statuses]
 
 
 def matching(data: Data, check: str) -> list[Data]:
