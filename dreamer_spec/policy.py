@@ -149,7 +149,7 @@ class Policy:
         if key not in observation:
             expected = [len(self._action), *space.array_shape]
             raise ValueError(
-                f"observation {key!r} is missing: expected shape {expected}, got the keys {sorted(observation)}"
+                f"observation: missing {key!r}; expected shape {expected}, got the keys {sorted(observation)}"
             )
         value = np.asarray(observation[key])
         require_shape(f"observation {key!r}", value.shape, len(self._action), *space.array_shape)

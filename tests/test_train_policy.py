@@ -244,7 +244,7 @@ def test_what_the_environment_returns_is_what_the_policy_sees(policy: Policy) ->
 
 
 WRONG = [
-    ({"mode": None}, r"observation 'mode' is missing: expected shape \[4, 2\], got the keys \['image', 'position'\]"),
+    ({"mode": None}, r"observation: missing 'mode'; expected shape \[4, 2\], got the keys \['image', 'position'\]"),
     ({"position": np.zeros((3, 3))}, r"observation 'position': expected shape \[4, 3\], got \[3, 3\]"),
     ({"position": np.zeros(3)}, r"observation 'position': expected shape \[4, 3\], got \[3\]"),
     ({"position": np.full((4, 3), np.nan)}, "observation 'position' holds nan; expected finite numbers"),
