@@ -1,7 +1,7 @@
 """Training for real: `train --backend jax|torch --task SUITE:NAME`. The way through: cli.py, options.py, training/.
 
-The rooms by level, the lowest first. A module imports from lower levels and from its own room: never from above, never
-from another room of its level, never in a circle. tests/test_repository.py reads this table and checks it.
+The packages by level, the lowest first. A module imports from lower levels and from its own package: never from above,
+never from another package of its level, never in a circle. tests/test_repository.py reads this table and checks it.
 
   errors, own_packages, words                  what the user can mend, in one line; how counts are said
   system                                       the process and its machine: cores, memory, threads, signals

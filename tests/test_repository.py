@@ -127,21 +127,21 @@ def imported_modules(path: Path, modules: Iterable[str]) -> set[str]:
     return {name.removeprefix("dreamer_spec.") for name in found if name.startswith("dreamer_spec.")}
 
 
-def test_the_rooms_of_the_trainer_point_one_way() -> None:
-    """By the table in dreamer_spec/__init__.py: nothing imports from above, or from another room of its level."""
-    rows = re.findall(r"^  (\S+(?:, \S+)*)  +\S", inspect.getdoc(importlib.import_module("dreamer_spec")) or "", re.M)
-    levels = {room: level for level, row in enumerate(rows) for room in row.split(", ")}
+def test_the_packages_of_the_trainer_point_one_way() -> None:
+    """By the table in dreamer_spec/__init__.py: nothing imports from above, or from another package of its level."""
+    lines = re.findall(r"^  (\S+(?:, \S+)*)  +\S", inspect.getdoc(importlib.import_module("dreamer_spec")) or "", re.M)
+    levels = {name: level for level, names in enumerate(lines) for name in names.split(", ")}
     modules = modules_of_the_trainer()
 
-    def room(module: str) -> str:
+    def place(module: str) -> str:
         package, _, inside = module.partition(".")
         return f"{package}.*" if inside and f"{package}.*" in levels else package
 
-    assert {room(module) for module in modules} == set(levels), "the table does not name every room once"
+    assert {place(module) for module in modules} == set(levels), "the table does not name every package once"
     for module, path in modules.items():
-        here = room(module)
+        here = place(module)
         for other in imported_modules(path, modules):
-            assert room(other) == here or levels[room(other)] < levels[here], (
+            assert place(other) == here or levels[place(other)] < levels[here], (
                 f"{module} imports {other}, which is not below"
             )
 
