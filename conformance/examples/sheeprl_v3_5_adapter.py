@@ -17,7 +17,14 @@ import torch
 from sheeprl.algos.dreamer_v3_5 import agent, dreamer_v3_5, loss
 from sheeprl.algos.dreamer_v3_5.optim import LaProp
 from sheeprl.utils.utils import symexp, symlog  # noqa: F401
-from sheeprl_adapter import categorical_kl, convert, percentile, return_scale, setup, update_return_range  # noqa: F401 - offered here, too
+from sheeprl_adapter import (  # noqa: F401 - offered here, too
+    categorical_kl,
+    convert,
+    percentile,
+    return_scale,
+    setup,
+    update_return_range,
+)
 from sheeprl_v3_5_networks import (  # noqa: F401 - some are offered here, too
     block_linear,
     decoder,
