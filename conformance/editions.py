@@ -18,8 +18,9 @@ from conformance.adapter import OBJECTS
 from conformance.adapters.numpy_adapter import NumpyAdapter
 from conformance.case import Call, Equal, Refused, Setting
 from conformance.check import CHECKS, Check
-from conformance.compare import WIDE, Comparisons, Unjudged, Worst, round_to
+from conformance.compare import WIDE, Comparisons, Unjudged, Worst, is_extreme, round_to
 from conformance.diagnosis import AGREEMENT, DERIVATIVES, VALUES
+from conformance.drawing import cases
 from conformance.execute import FAILING, CheckOptions, Result, missing, not_offered, outcome, run, run_check
 from conformance.judge import Ask, asking, copied, judge_refusal, standing_in
 from conformance.mutants import MUTANTS, Mutant, MutantAdapter
@@ -100,8 +101,18 @@ def judge_twice(
     result = judge(check, adapter, edition, dtype, seed, examples)
     if result.status not in FAILING:
         return result
+    if _asks_nothing_ordinary(check, Setting(dtype, edition.profile, seed, AGAIN * examples)):
+        return dataclasses.replace(result, extreme=True)
     again = judge(check, adapter, edition, dtype, seed, AGAIN * examples, shrink=False, ordinary=True)
     return dataclasses.replace(result, extreme=again.status == "pass")
+
+
+def _asks_nothing_ordinary(check: Check, setting: Setting) -> bool:
+    """Whether every call of a check has extreme input or is to be refused."""
+    if check.cases is None:
+        return False
+    found = [case for case, _ in cases(check.cases, setting)]
+    return all(case.refused is not None or all(is_extreme(call.arguments) for call in case.calls) for case in found)
 
 
 def by_comparison(result: Result, edition: Edition, asked: CheckOptions) -> bool:

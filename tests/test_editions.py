@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from conformance.adapters.numpy_adapter import NumpyAdapter
-from conformance.case import Cases, Setting, exact, refused
+from conformance.case import Cases, Setting, exact, refused, related
 from conformance.check import Check
 from conformance.cli import main
+from conformance.compare import Comparisons
 from conformance.editions import (
     NOT_JUDGED,
     PREFERRED,
@@ -21,6 +22,7 @@ from conformance.editions import (
     fit,
     fits_better,
     judge,
+    judge_twice,
     own_reference,
     telling_checks,
 )
@@ -210,6 +212,32 @@ def test_what_the_edition_refuses_must_be_refused() -> None:
         result = judge(check, types.SimpleNamespace(twohot=function), editions()["2023"], "float64")
         assert result.status == status, result.message
         assert status == "pass" or "must raise a ValueError" in result.message
+
+
+def test_a_check_of_extreme_input_alone_fails_with_extreme_input_only() -> None:
+    one, special = np.array([1.0]), np.array([np.nan])
+
+    def same(c: Comparisons, first: np.ndarray, second: np.ndarray) -> None:
+        c.exact("both", second, first + 1)
+
+    def refusals(setting: Setting) -> Cases:
+        yield refused("f", np.zeros(0))
+
+    def not_finite(setting: Setting) -> Cases:
+        yield exact("f", (special,), special)
+
+    def both(setting: Setting) -> Cases:
+        yield from not_finite(setting)
+        yield exact("f", (one,), one)
+
+    def in_one_case(setting: Setting) -> Cases:
+        yield related(same, ("f", (one,)), ("f", (special,)))
+
+    zeros, paper = types.SimpleNamespace(f=np.zeros_like), editions()["paper"]
+    for build, extreme in ((refusals, True), (not_finite, True), (both, False), (in_one_case, False)):
+        check = Check("transforms.made_up", (), ("f",), 0, ("float64",), "", build)
+        result = judge_twice(check, zeros, paper, "float64")
+        assert (result.status, result.extreme) == ("fail", extreme), build
 
 
 @pytest.mark.parametrize(
