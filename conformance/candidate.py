@@ -143,7 +143,9 @@ def candidate(
       UserError: neither or both are given, or there is no such candidate.
     """
     if (name is None) == (command is None):
-        raise UserError("give either a candidate (jax, torch, numpy, trainer, a module or a .py file) or --process COMMAND")
+        raise UserError(
+            "give either a candidate (jax, torch, numpy, trainer, a module or a .py file) or --process COMMAND"
+        )
     if command is None:
         assert name is not None
         yield load_candidate(name, dtype, device)

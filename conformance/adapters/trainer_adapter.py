@@ -4,14 +4,12 @@ Nothing is computed here. Functions are those that the modules of the trainer ca
 has another form in the trainer has its arguments and its result brought into that of the interface.
 """
 
-import functools
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from dreamer_spec.envs import records, vector
-from dreamer_spec.replay import Replay
+from dreamer_spec.envs import vector
 from dreamer_spec.training import loop, setup
 from dreamer_spec.translation import Entry, Translation
 from spec import Spaces, Vector
@@ -26,13 +24,14 @@ class TrainerAdapter:
     What only a running loop shows, such as when it acts and what it saves, is tested in tests/.
     """
 
-    # In float32, as `--replay-deter float32` has it: the checks compare latents bit by bit.
-    Replay = staticmethod(functools.partial(Replay, deter_dtype="float32"))
-
     def __getattr__(self, name: str) -> Any:
         if name not in CALLED_BY:
             raise AttributeError(name)
         return getattr(CALLED_BY[name], name)
+
+    def Replay(self, capacity: int, length: int) -> Any:  # noqa: N802
+        """Latents in float32, as with `--replay-deter float32`: the checks compare them bit by bit."""
+        return setup.Replay(capacity, length, deter_dtype="float32")
 
     def make_record(
         self,
@@ -43,12 +42,12 @@ class TrainerAdapter:
         deter: Any,
         stoch: Any,
     ) -> dict[str, np.ndarray]:
-        """The record of one worker: `records.observed`, then `records.stored`.
+        """The record of one worker: what the environments give, and what is stored of it.
 
         stoch: one-hot [S, C]; a run gets the latents from its backend as class indices [S] already.
         """
         latents = {"deter": np.asarray(deter)[None], "stoch": np.argmax(stoch, axis=-1)[None]}
-        record = records.stored(records.observed([observation], [reward], [flags]), np.asarray(action)[None], latents)
+        record = loop.stored(vector.observed([observation], [reward], [flags]), np.asarray(action)[None], latents)
         return {key: value[0] for key, value in record.items()}
 
     def environment_action(
@@ -71,12 +70,12 @@ class TrainerAdapter:
 
 def make_adapter(dtype: str, device: str | None) -> TrainerAdapter:
     """Raises:
-    ValueError: a precision other than float64, or a device: the trainer leaves both to its backend.
+    ValueError: a precision other than float64, or a device other than the CPU: the trainer leaves both to its backend.
     """
-    if dtype != "float64" or device is not None:
-        asked = f"dtype {dtype}" if device is None else f"device {device}"
+    if dtype != "float64" or device not in (None, "cpu"):
+        asked = f"--dtype {dtype}" if dtype != "float64" else f"--device {device}"
         raise ValueError(
-            f"the trainer has no {asked}: what is checked of it computes on the CPU in float64; "
-            "check the backend: jax or torch"
+            f"the trainer has no {asked}: what is checked of it computes in float64 on the CPU, and precision and "
+            "device are the backend's; check jax or torch"
         )
     return TrainerAdapter()

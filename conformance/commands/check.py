@@ -42,7 +42,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--process", metavar="COMMAND", help="a command that starts a candidate of its own, see docs/adapters.md"
     )
     parser.add_argument("--timeout", type=float, default=120.0, help="seconds that a process has for each reply")
-    parser.add_argument("--dtype", choices=DTYPES, default="float64", help="precision of the backend; the trainer has float64 alone")
+    parser.add_argument(
+        "--dtype", choices=DTYPES, default="float64", help="precision of the backend; the trainer has float64 alone"
+    )
     parser.add_argument(
         "--device", default=None, help="device of the backend, as the backend names it: cpu, cuda, gpu, ..."
     )

@@ -1,4 +1,4 @@
-"""Records as in spec/00-notation.md, of N workers side by side: what the environments gave, and what the policy adds."""
+"""Records as in spec/00-notation.md of N workers side by side: what the environments gave, and what the policy adds."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -13,8 +13,8 @@ def observed(
 ) -> Record:
     """What came from the environments, [N, ...] each and in memory of its own. [LOOP-9], [LOOP-10], [CON-10]
 
-    observations: key -> array, of each worker; keys come in sorted order, as in `Spaces`. rewards: what arrived with them; count as 0 at is_first.
-    flags: `step_flags` of each worker.
+    observations: key -> array, of each worker; the result has the keys in sorted order, as `Spaces` has them.
+    rewards: what arrived with the observations; count as 0 at is_first. flags: `step_flags` of each worker.
     """
     return {
         **{key: np.stack([observation[key] for observation in observations]) for key in sorted(observations[0])},
