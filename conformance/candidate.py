@@ -10,7 +10,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from conformance.adapter import IMPLEMENTATIONS, INTERFACE, OBJECTS, load_adapter
+from conformance.adapter import INTERFACE, OBJECTS, OUR_CANDIDATES, TRAINER, load_adapter
 from conformance.errors import UserError
 from conformance.foreign import ForeignAdapter, as_edition
 from conformance.own_names import ours, ours_in
@@ -81,19 +81,20 @@ def _require_arguments(name: str, function: Any) -> None:
 
 
 def load_candidate(name: str, dtype: str, device: str | None = None) -> object:
-    """The adapter of one of our implementations, or a module or file of somebody's own. device: of our implementations.
+    """The adapter of one of our candidates, or a module or file of somebody's own. device: of our candidates.
 
     Raises:
       UserError: there is no such thing, or what it needs is not there. A mistake inside of somebody's module keeps its
         traceback.
     """
-    if name in IMPLEMENTATIONS:
+    if name in OUR_CANDIDATES:
         try:
             return load_adapter(name, dtype, device)
         except ImportError as error:
             if name == "numpy":
                 raise  # The reference needs no extra: its packages are always installed.
-            raise UserError(f"{error}; install it with: pip install 'dreamer-spec[{name}]'") from error
+            extra = "train" if name == TRAINER else name
+            raise UserError(f"{error}; install it with: pip install 'dreamer-spec[{extra}]'") from error
         except (ValueError, RuntimeError) as error:
             raise UserError(str(error).partition("\n")[0]) from error
     if taken := ours(name):
@@ -119,7 +120,7 @@ def _load_module(name: str) -> ModuleType:
             raise UserError(f"no file {name}; `conformance new-adapter {name}` writes one to fill in")
         return load_file(Path(name))
     unknown = UserError(
-        f"no module named {name!r}; give one of {', '.join(IMPLEMENTATIONS)}, a module on PYTHONPATH, or a .py file"
+        f"no module named {name!r}; give one of {', '.join(OUR_CANDIDATES)}, a module on PYTHONPATH, or a .py file"
     )
     if not all(part.isidentifier() for part in name.split(".")):
         raise unknown
@@ -142,7 +143,9 @@ def candidate(
       UserError: neither or both are given, or there is no such candidate.
     """
     if (name is None) == (command is None):
-        raise UserError("give either a candidate (jax, torch, numpy, a module or a .py file) or --process COMMAND")
+        raise UserError(
+            "give either a candidate (jax, torch, numpy, trainer, a module or a .py file) or --process COMMAND"
+        )
     if command is None:
         assert name is not None
         yield load_candidate(name, dtype, device)

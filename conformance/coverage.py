@@ -3,15 +3,15 @@
 import ast
 from pathlib import Path
 
-from conformance.adapter import IMPLEMENTATIONS, load_adapter
+from conformance.adapter import OUR_CANDIDATES, TRAINER, load_adapter
 from conformance.check import CHECKS
 from conformance.execute import missing, selected_checks
 from conformance.requirements import requirements
 
-# Replay and the training loop are chapters that no backend implements. Of the reference's functions the trainer uses
-# `Replay`, `ReplayRatio`, `can_train` and `derive_seed`; what it says itself is covered by the tests.
+# Replay and the training loop are chapters of the reference and of the trainer, and of no backend; the trainer has no
+# others.
 SHARED_CHAPTERS = ("REP", "LOOP")
-OURS = ("conformance", "impl_jax", "impl_torch", "reference_numpy", "spec")
+OURS = ("conformance", "dreamer_spec", "impl_jax", "impl_torch", "reference_numpy", "spec")
 TESTS = Path(__file__).resolve().parent.parent / "tests"
 
 
@@ -38,7 +38,7 @@ def coverage() -> tuple[dict[str, dict[str, list[str]]], list[str]]:
                 if requirement in check.requirements and not missing(adapters[implementation], check)
             ]
             for implementation in adapters
-            if implementation == "numpy" or not shared
+            if implementation == "numpy" or (implementation == TRAINER) == shared
         }
         table[requirement] = {**checks, **({"tests": tests.get(requirement, [])} if tests else {})}
         if tests and requirement not in tests:
@@ -62,7 +62,7 @@ def coverage() -> tuple[dict[str, dict[str, list[str]]], list[str]]:
 def installed_adapters() -> dict[str, object]:
     """Implementation -> its adapter, for those whose libraries are installed."""
     found = {}
-    for implementation in IMPLEMENTATIONS:
+    for implementation in OUR_CANDIDATES:
         try:
             found[implementation] = load_adapter(implementation)
         except ModuleNotFoundError as error:

@@ -31,9 +31,9 @@ class Entry:
     """One value of the environment.
 
     path: where it lies. shape, dtype: its form there. scalar: it is one number, not an array.
-    low, high: of an image, the numbers that become 0 and 255; of a real-valued action, what -1 and 1 become, in
-    row-major order; low of choices, the numbers that they are counted from. One number stands for as many equal ones.
-    Empty where bounds do not count.
+    low, high: of an image, the numbers that become 0 and 255; of a real-valued action, its bounds in row-major order,
+    infinite where there is none; low of choices, the numbers that they are counted from. One number stands for as many
+    equal ones. Empty where bounds do not count.
     """
 
     path: Path
@@ -84,7 +84,7 @@ class Translation:
             {key: np.broadcast_to(getattr(entry, bound), math.prod(entry.shape)) for key, entry in reals.items()}
             for bound in ("low", "high")
         )
-        parts = environment_action(np.asarray(flat, np.float32), self.spaces, low, high)
+        parts = environment_action(flat, self.spaces, low, high)
         return _nested([(entry.path, _decode(parts[key], entry, key in reals)) for key, entry in self.actions.items()])
 
     def differences(self, other: "Translation") -> list[str]:
@@ -102,9 +102,9 @@ class Translation:
         }
 
     def to_json(self) -> dict[str, Any]:
-        """All but the spaces and the lines, in plain JSON types."""
+        """All but the spaces and the lines, in plain JSON types. An infinite bound is null."""
         described = {
-            name: {key: dataclasses.asdict(entry) for key, entry in getattr(self, name).items()}
+            name: {key: _described(entry) for key, entry in getattr(self, name).items()}
             for name in ("observations", "actions")
         }
         return {**described, "left_out": [list(path) for path in self.left_out]}
@@ -246,6 +246,14 @@ def _nested(values: list[tuple[Path, Any]]) -> Any:
     return tuple(entries[place] for place in range(len(entries))) if isinstance(values[0][0][0], int) else entries
 
 
+# Descriptions
+
+
+def _described(entry: Entry) -> dict[str, Any]:
+    bounds = {name: [None if math.isinf(n) else n for n in getattr(entry, name)] for name in ("low", "high")}
+    return {**dataclasses.asdict(entry), **bounds}
+
+
 # Descriptions that nobody vouches for
 
 
@@ -269,10 +277,14 @@ def _entry(name: str, description: Any, target: Target, acts: bool) -> Entry:
         } if (
             len(description) == 6
             and dtype in DTYPES
-            and all(map(_is_finite, (*low, *high)))
+            and all(number is None or _is_finite(number) for number in (*low, *high))
             and all(map(_is_size, shape))
         ):
-            entry = Entry(_path(path), tuple(shape), dtype, tuple(low), tuple(high), scalar)
+            bottom, top = (
+                tuple(missing if number is None else number for number in bound)
+                for bound, missing in ((low, -math.inf), (high, math.inf))
+            )
+            entry = Entry(_path(path), tuple(shape), dtype, bottom, top, scalar)
             most = _bounds(target, acts)
             if all(len(bound) in (min(1, size), size) for bound, size in zip((low, high), most, strict=True)) and _fits(
                 entry, target
@@ -302,6 +314,7 @@ def _fits(entry: Entry, target: Target) -> bool:
             return (
                 axes is not None
                 and size == entry.shape[axes[0]] * entry.shape[axes[1]] * target.channels
+                and all(map(math.isfinite, (*entry.low, *entry.high)))
                 and entry.low < entry.high
             )
         case Discrete():

@@ -59,6 +59,7 @@ def test_an_installed_package(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
     table, problems = module.coverage()
     assert problems == []
     assert set(table["RET-3"]) == {"numpy", "torch"}
+    assert set(table["REP-3"]) == set(table["LOOP-12"]) == {"numpy", "trainer"}
 
 
 def test_a_mistake_of_ours_is_not_a_missing_library(monkeypatch: pytest.MonkeyPatch) -> None:

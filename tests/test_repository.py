@@ -28,7 +28,7 @@ MAY_IMPORT = {
     "conformance": {"spec", "reference_numpy"},
     "dreamer_spec": {"spec", "reference_numpy", "conformance"},
 }
-ADAPTERS = {"jax_adapter.py": "impl_jax", "torch_adapter.py": "impl_torch"}
+ADAPTERS = {"jax_adapter.py": "impl_jax", "torch_adapter.py": "impl_torch", "trainer_adapter.py": "dreamer_spec"}
 
 
 def public_functions(chapter: str) -> list[tuple[str, object]]:

@@ -151,6 +151,9 @@ def test_an_even_image_stays_even_and_a_resized_one_is_the_nearest_whole_number(
         ([-999_999.0], [999_999.0], (-999_999, -499_999.5, 0, 999_999)),
         ([2e6], [3e6], (2e6, 2e6 + 0.5, 2e6 + 1, 2e6 + 2)),
         ([999_999.0], [1_000_000.5], (999_999, 999_999.375, 999_999.75, 1_000_000.5)),
+        ([-1_000_000.5], [-999_999.0], (-1_000_000.5, -1_000_000.125, -999_999.75, -999_999)),
+        ([999_999.0], [1_000_001.0], (999_999, 999_999.5, 1_000_000, 1_000_001)),
+        ([-3e6], [-2e6], (-2e6 - 2, -2e6 - 1.5, -2e6 - 1, -2e6)),
         ([4.0], [4.0], (4, 4, 4, 4)),
     ],
 )
@@ -169,7 +172,7 @@ def test_what_the_numbers_of_an_action_become(low: list[float], high: list[float
 def test_actions_agree_with_the_reference_in_every_kind_of_bounds() -> None:
     low, high = np.array([-3, 0, -np.inf, -np.inf, 0.5]), np.array([1, 1e3, np.inf, 0.5, np.inf])
     translation, rng = translate(TWO, gym.Box(low, high, dtype=np.float64)), np.random.default_rng(0)
-    for flat in rng.normal(size=(200, 5)).astype(F4):
+    for flat in (*rng.normal(size=(200, 5)).astype(F4), np.full(5, 1e-20)):
         np.testing.assert_array_equal(
             translation.action(flat),
             environment_action(flat, translation.spaces, {"action": low}, {"action": high})["action"],

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from conformance.adapter import IMPLEMENTATIONS
+from conformance.adapter import OUR_CANDIDATES
 from conformance.candidate import candidate, remarks
 from conformance.check import Check
 from conformance.compare import DTYPES
@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "candidate",
         nargs="?",
         help=(
-            "jax, torch or numpy; or an adapter of your own with functions of "
+            "jax, torch, numpy or trainer; or an adapter of your own with functions of "
             "conformance/adapter.py: a module or a .py file"
         ),
     )
@@ -42,7 +42,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--process", metavar="COMMAND", help="a command that starts a candidate of its own, see docs/adapters.md"
     )
     parser.add_argument("--timeout", type=float, default=120.0, help="seconds that a process has for each reply")
-    parser.add_argument("--dtype", choices=DTYPES, default="float64", help="precision of the backend")
+    parser.add_argument(
+        "--dtype", choices=DTYPES, default="float64", help="precision of the backend; the trainer has float64 alone"
+    )
     parser.add_argument(
         "--device", default=None, help="device of the backend, as the backend names it: cpu, cuda, gpu, ..."
     )
@@ -80,7 +82,7 @@ def main(console: Console, options: argparse.Namespace) -> int:
         for remark in remarks(adapter):
             console.print(remark, markup=False, highlight=False)
         implementation = identity(adapter, options.candidate or options.process or "")
-        given = options.edition or (OUR_EDITION if options.candidate in IMPLEMENTATIONS else None)
+        given = options.edition or (OUR_EDITION if options.candidate in OUR_CANDIDATES else None)
         named = given or _claimed(implementation["edition"])
         fits = [] if named else _fit(console, checks, adapter, options)
         asked = CheckOptions(

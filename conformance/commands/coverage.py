@@ -7,7 +7,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from conformance.adapter import IMPLEMENTATIONS
+from conformance.adapter import OUR_CANDIDATES
 from conformance.check import CHECKS
 from conformance.coverage import coverage
 from conformance.requirements import check_label, requirements
@@ -21,20 +21,20 @@ def main(console: Console, options: argparse.Namespace) -> int:
     del options
     table, problems = coverage()
     view = Table()
-    columns = (*IMPLEMENTATIONS, "tests")
+    columns = (*OUR_CANDIDATES, "tests")
     for column in ("requirement", *columns, "text"):
         view.add_column(column, min_width=len(column))
     for requirement, covering in table.items():
         counts = (str(len(covering[column])) if column in covering else "-" for column in columns)
         text = textwrap.shorten(requirements()[requirement], 80, placeholder=" ...")
-        names = dict.fromkeys(name for column in IMPLEMENTATIONS for name in covering.get(column, ()))
+        names = dict.fromkeys(name for column in OUR_CANDIDATES for name in covering.get(column, ()))
         labels = [check_label(name, CHECKS[name].requirements) for name in names]
         view.add_row(requirement, *counts, escape("\n".join(filter(None, [text, ", ".join(labels)]))))
     console.print(view)
     for problem in problems:
         console.print(f"[bold red]{problem}")
     there = {column for covering in table.values() for column in covering}
-    if absent := [column for column in IMPLEMENTATIONS if column not in there]:
+    if absent := [column for column in OUR_CANDIDATES if column not in there]:
         console.print(f"not installed, so not looked at: {', '.join(absent)}")
     if "tests" not in there:
         unchecked = sum(not any(covering.values()) for covering in table.values())

@@ -3,7 +3,7 @@
 import shlex
 from typing import Any
 
-from conformance.adapter import IMPLEMENTATIONS, INTERFACE, OBJECTS
+from conformance.adapter import INTERFACE, OBJECTS, OUR_CANDIDATES
 from conformance.execute import CheckOptions, FailedCall, Result
 from conformance.reports.values import WRITTEN_OUT, is_known, shown, size, source
 
@@ -101,7 +101,7 @@ def _adapter(options: CheckOptions) -> tuple[str, str]:
     if options.process:
         made = f"ProcessAdapter({options.candidate!r}, {options.dtype!r}, timeout=120)"
         return "from conformance.process import ProcessAdapter", f"adapter = {made}"
-    device = f", {options.device!r}" if options.device and options.candidate in IMPLEMENTATIONS else ""
+    device = f", {options.device!r}" if options.device and options.candidate in OUR_CANDIDATES else ""
     return (
         "from conformance.candidate import load_candidate",
         f"adapter = load_candidate({options.candidate!r}, {options.dtype!r}{device})",

@@ -5,9 +5,10 @@ from dreamer_spec.envs.adapter import ContractEnv
 from dreamer_spec.envs.factory import env_maker, make_env
 from dreamer_spec.envs.failure import Failure
 from dreamer_spec.envs.history import History
+from dreamer_spec.envs.records import Record, stored
 from dreamer_spec.envs.spaces import doubts, random_actions, translate
 from dreamer_spec.envs.trial import Trial, try_out
-from dreamer_spec.envs.vector import Environments, Record
+from dreamer_spec.envs.vector import Environments
 from dreamer_spec.translation import Translation
 
 __all__ = [
@@ -22,6 +23,7 @@ __all__ = [
     "env_maker",
     "make_env",
     "random_actions",
+    "stored",
     "translate",
     "try_out",
 ]

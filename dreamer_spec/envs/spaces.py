@@ -16,6 +16,7 @@ from gymnasium import spaces as gym
 from dreamer_spec.errors import UserError
 from dreamer_spec.translation import DTYPES, LEAST_SIDE, Entry, Path, Target, Translation, side_axes
 from dreamer_spec.words import counted
+from reference_numpy.training_loop import environment_action
 from spec import Discrete, Image, Spaces, Vector
 
 NO_BOUND = 1e6  # from here on a bound is none, see E-20
@@ -253,29 +254,40 @@ def _action(key: str, path: Path, space: gym.Space[Any]) -> Meaning:
             raise _unsupported("action", key, space, remedy)
         words = f"{counted(len(counts), 'choice')} of {_span(counts)} classes"
         return Meaning(Discrete(tuple(counts)), _entry(path, space, low=space.low), _declared(space), words)
-    low, high, warnings = _ranges(space)
-    words = f"{counted(low.size, 'real number')} in {_intervals(low, high)}"
-    return Meaning(Vector(low.size), _entry(path, space, low=low, high=high), _declared(space), words, warnings)
+    low, high = _bounds(space)
+    words = f"{counted(low.size, 'real number')} in {_intervals(*_range(low, high))}"
+    entry = _entry(path, space, low=low, high=high)
+    return Meaning(Vector(low.size), entry, _declared(space), words, tuple(_action_warnings(low, high)))
 
 
-def _ranges(space: gym.Box) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
-    """What -1 and 1 become, [size] each, all finite, and what may surprise: [LOOP-12], [LOOP-58]."""
+def _bounds(space: gym.Box) -> tuple[np.ndarray, np.ndarray]:
+    """The bounds of each number, [size] each, infinite where there is none: [LOOP-58]."""
     low, high = (bound.astype(np.float64).ravel() for bound in (space.low, space.high))
-    below, above = low <= -NO_BOUND, high >= NO_BOUND
-    least = np.where(below, np.where(above, -1.0, high - 2.0), low)
-    most = np.where(above, np.where(below, 1.0, np.minimum(low + 2.0, high)), high)
+    wide = high > low + 2.0
+    return np.where(wide & (low <= -NO_BOUND), -np.inf, low), np.where(wide & (high >= NO_BOUND), np.inf, high)
+
+
+def _range(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What -1 and 1 become between these bounds, [size] each."""
+    alone = Spaces({"observation": Vector(1)}, {"action": Vector(low.size)})
+    least, most = (
+        environment_action(np.full(low.size, end), alone, {"action": low}, {"action": high})["action"]
+        for end in (-1.0, 1.0)
+    )
+    return least, most
+
+
+def _action_warnings(low: np.ndarray, high: np.ndarray) -> Iterator[str]:
+    below, above = np.isinf(low), np.isinf(high)
     remedy = "if that is not the range, declare it, for example with gymnasium.wrappers.TransformAction"
     doubts = {
         "without bounds": ("[-1, 1]", int((below & above).sum())),
         "with one bound": ("the 2 units next to it", int((below != above).sum())),
     }
     numbers = f"of {counted(low.size, 'number')}"
-    warnings = (
-        f"{count} {numbers} {bounds} below {NO_BOUND:,.0f}: moved in {where}; {remedy}"
-        for bounds, (where, count) in doubts.items()
-        if count
-    )
-    return least, most, tuple(warnings)
+    for bounds, (where, count) in doubts.items():
+        if count:
+            yield f"{count} {numbers} {bounds} below {NO_BOUND:,.0f}: moved in {where}; {remedy}"
 
 
 # Both

@@ -13,15 +13,14 @@ from dreamer_spec.envs.failure import Failure
 from dreamer_spec.envs.history import History, OngoingEpisode
 from dreamer_spec.envs.info import EpisodeInfo
 from dreamer_spec.envs.process import CLOSING
+from dreamer_spec.envs.records import Record, observed
 from dreamer_spec.envs.stream import Step
 from dreamer_spec.envs.trial import Trial, make_here, try_out
 from dreamer_spec.envs.worker import InProcess, OwnProcess, Worker, receive
 from dreamer_spec.errors import UserError
 from dreamer_spec.translation import Translation
-from reference_numpy.training_loop import derive_seed
+from reference_numpy.training_loop import derive_seed, step_flags
 from spec import Spaces
-
-Record = dict[str, np.ndarray]
 
 WINDOW = 100_000  # records of all workers among which failures are counted
 
@@ -222,17 +221,14 @@ class Environments:
 
     def _record(self, steps: Mapping[int, Step]) -> Record:
         """The steps side by side, in memory of their own."""
-        for worker, episode in self._episodes.items():
+        flags = []
+        for worker in range(self.count):
+            episode = self._episodes[worker]
             if episode.is_last:
                 self._episodes[worker] = episode = episode.next()
-            episode.add(self._action[worker], is_last=bool(steps[worker][2] or steps[worker][3]))
+            flags.append(step_flags(episode.records == 0, *steps[worker][2:4]))
+            episode.add(self._action[worker], is_last=flags[-1]["is_last"])
         self._records += self.count
         self.info = [steps[worker][4].get("metrics", EpisodeInfo()).values for worker in range(self.count)]
-        observations, rewards, terminated, _, _ = zip(*(steps[worker] for worker in range(self.count)), strict=True)
-        return {
-            **{key: np.stack([observation[key] for observation in observations]) for key in self.spaces.observations},
-            "reward": np.array(rewards, np.float32),
-            "is_first": np.array([episode.records == 1 for episode in self._episodes.values()]),
-            "is_last": np.array([episode.is_last for episode in self._episodes.values()]),
-            "is_terminal": np.array(terminated, bool),
-        }
+        observations, rewards, _, _, _ = zip(*(steps[worker] for worker in range(self.count)), strict=True)
+        return observed(observations, rewards, flags)

@@ -7,7 +7,7 @@ from contextlib import ExitStack
 import numpy as np
 
 from dreamer_spec.backend import Learner
-from dreamer_spec.envs import Record
+from dreamer_spec.envs import Record, stored
 from dreamer_spec.monitoring.logger import Watch
 from dreamer_spec.options import Options
 from dreamer_spec.system.signals import Stopped, stoppable
@@ -91,8 +91,7 @@ def remember_and_learn(run: TrainingRun, record: Record, action: np.ndarray, lat
     """Adds the workers' records one by one, and after each one trains as often as the replay ratio says: [LOOP-4], or
     later: [LOOP-65]."""
     with run.clock.part("replay"):
-        action = np.where(record["is_last"][:, None], np.float32(0), action)  # [LOOP-9]: nothing can be done at an end.
-        packed = run.replay.pack({**record, "action": action, **latents})
+        packed = run.replay.pack(stored(record, action, latents))
         for worker in range(run.envs.count):
             run.replay.add_packed(packed, worker, worker)
             run.counters.records += 1
