@@ -1,18 +1,42 @@
 """Fixtures that several files of tests share."""
 
+import gc
+import os
+import subprocess
 import sys
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import jax
 import pytest
-from jax.experimental.compilation_cache import compilation_cache
 from train_fakes import FakeLearner
 from train_runs import SMALL, Make
 
 from dreamer_spec.options import Options, assemble_options
 from spec import hyperparameters
+
+QUICK = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """JAX compiles without optimizations that take longer than the tests' small programs, and each program once for all
+    processes of a session."""
+    if hasattr(config, "workerinput"):
+        return  # of pytest-xdist: it has the environment already
+    folder = tempfile.TemporaryDirectory(prefix="compiled-")
+    config.add_cleanup(folder.cleanup)
+    os.environ |= {"JAX_COMPILATION_CACHE_DIR": folder.name, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+    trial = {**os.environ, "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {QUICK}".strip()}
+    if not subprocess.run(
+        [sys.executable, "-c", "import jax; jax.devices()"], env=trial, capture_output=True
+    ).returncode:
+        os.environ |= trial  # a version of XLA that does not know a flag ends the process
+
+
+def pytest_collection_finish() -> None:
+    """Libraries and tests hold millions of objects, which every later `gc.collect()` would walk through."""
+    gc.freeze()
 
 
 @pytest.fixture(autouse=True)
@@ -46,20 +70,3 @@ def make(tmp_path: Path) -> Iterator[Make]:
 
     yield options
     FakeLearner.loss = 1.0
-
-
-@pytest.fixture(scope="module")
-def compile_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """JAX learners with the same configuration compile the same programs, whatever their seed: once in a file of
-    tests."""
-    settings = {
-        "jax_compilation_cache_dir": str(tmp_path_factory.mktemp("compiled")),
-        "jax_persistent_cache_min_compile_time_secs": 0.0,
-    }
-    before = {name: getattr(jax.config, name) for name in settings}
-    for values in (settings, before):
-        for name, value in values.items():
-            jax.config.update(name, value)
-        compilation_cache.reset_cache()
-        if values is settings:
-            yield

@@ -13,8 +13,6 @@ from dreamer_spec.disk import checkpoint
 from reference_numpy import agent as reference
 from spec import Config, Discrete, Spaces, parameter_table
 
-pytestmark = pytest.mark.usefixtures("compile_once")
-
 BACKENDS = ("jax", "torch")
 ENVS = 6
 TASK = spaces("vector", "mixed")

@@ -39,13 +39,8 @@ def command(backend: str, logdir: Path, *more: str) -> list[str]:
 
 
 def start(call: list[str], output: Path) -> "subprocess.Popen[bytes]":
-    # Compiled once for all processes of a test: what is tested is the run, not the compiler.
-    cache = {
-        "JAX_COMPILATION_CACHE_DIR": str(output.parent / "compiled"),
-        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
-    }
     with output.open("ab") as file:
-        return subprocess.Popen(call, cwd=ROOT, stdout=file, stderr=subprocess.STDOUT, env={**os.environ, **cache})
+        return subprocess.Popen(call, cwd=ROOT, stdout=file, stderr=subprocess.STDOUT)
 
 
 def finish(call: list[str], output: Path) -> None:

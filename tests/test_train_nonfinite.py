@@ -26,8 +26,6 @@ from dreamer_spec.errors import UserError
 from reference_numpy import agent, optimizer
 from spec import parameter_table
 
-pytestmark = pytest.mark.usefixtures("compile_once")
-
 TASK = spaces("vector", "discrete")
 LAYERS = {
     f"{part}_layers": 1

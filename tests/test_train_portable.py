@@ -25,8 +25,6 @@ from reference_numpy import agent as reference
 from reference_numpy.training_loop import derive_seed
 from spec import Config, Discrete, Image, Spaces, Vector, parameter_table
 
-pytestmark = pytest.mark.usefixtures("compile_once")
-
 CONFIG = small_config("paper", "float32", envs=2)
 COUNTING = Spaces({"observation": Vector(2)}, {"action": Vector(2)})
 CARTPOLE = Spaces({"observation": Vector(4)}, {"action": Discrete((2,))})

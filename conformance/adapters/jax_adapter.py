@@ -21,8 +21,11 @@ CHAPTERS = (transforms, distributions, layers, rssm, networks, world_model, retu
 # Functions of layers whose first array is not of the compute dtype; other chapters take float32 or better and convert
 # it themselves.
 EXACT = ("truncated_normal", "dense", "mlp")
-# Small calls take less time than optimizing them. Options of XLA come and go with its versions.
+# Options of XLA, which come and go with its versions. Small calls take less time than optimizing them. But where
+# rounding errors must cancel, what is judged is compiled as it is in training: they depend on what XLA fuses.
 QUICK = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+OPTIMIZED = {"xla_backend_optimization_level": 3, "xla_cpu_use_fusion_emitters": True}
+CANCELLING = (transforms, distributions, returns)
 
 
 class JaxAdapter:
@@ -33,7 +36,7 @@ class JaxAdapter:
         self.exact = np.dtype("float64" if dtype == "float64" else "float32")
         self.device = select_device(device)
         self.compiled: dict[Any, Callable[..., Any]] = {}
-        self.compiler_options: dict[str, Any] | None = None
+        self.quick = False
 
     def __getattr__(self, name: str) -> Any:
         for chapter in CHAPTERS:
@@ -50,7 +53,7 @@ class JaxAdapter:
     def compile_calls(self, calls: Iterable[tuple[str, tuple[Any, ...]]]) -> None:
         """Compiles what these calls need, several at a time, and everything without the optimizations that take longer
         than small calls themselves. What a call raises is raised when it is made."""
-        self.compiler_options = dict(filter(_is_accepted, QUICK.items()))
+        self.quick = True
         calls = (("gradients", inputs[:-1]) if name == "loss_derivatives" else (name, inputs) for name, inputs in calls)
         distinct = {_signature(call): call for call in calls}
         largest_first = sorted(distinct, key=lambda signature: len(str(signature)), reverse=True)
@@ -147,7 +150,9 @@ class JaxAdapter:
         statics = tuple(
             repr(argument) if static else None for argument, static in zip(arguments, is_static, strict=True)
         )
-        compiled = self.compiled.setdefault((key, statics), jax.jit(call, compiler_options=self.compiler_options))
+        cancelling = getattr(function, "__module__", "") in [module.__name__ for module in CANCELLING]
+        options = accepted(OPTIMIZED if cancelling else QUICK) if self.quick else None
+        compiled = self.compiled.setdefault((key, statics), jax.jit(call, compiler_options=options))
         with jax.default_device(self.device):
             return _to_numpy(compiled(*dynamic))
 
@@ -171,10 +176,15 @@ class JaxAdapter:
         return jax.device_put(array, self.device)  # jnp.asarray would compile for each shape
 
 
-def _is_accepted(option: tuple[str, Any]) -> bool:
-    """Whether this version of XLA knows the option."""
+def accepted(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Those that this version of XLA knows."""
+    return {name: value for name, value in options.items() if _is_accepted(name, value)}
+
+
+@functools.cache
+def _is_accepted(name: str, value: Any) -> bool:
     try:
-        jax.jit(lambda: jnp.zeros(()), compiler_options=dict([option]))()
+        jax.jit(lambda: jnp.zeros(()), compiler_options={name: value})()
     except jax.errors.JaxRuntimeError:
         return False
     return True
