@@ -34,8 +34,11 @@ def pytest_configure(config: pytest.Config) -> None:
         os.environ |= trial  # a version of XLA that does not know a flag ends the process
 
 
-def pytest_collection_finish() -> None:
-    """Libraries and tests hold millions of objects, which every later `gc.collect()` would walk through."""
+@pytest.fixture(scope="module", autouse=True)
+def keep_collections_short() -> Iterator[None]:
+    """What libraries and caches hold after a file of tests, millions of objects, later collections need not visit."""
+    yield
+    gc.collect()
     gc.freeze()
 
 
