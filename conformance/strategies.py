@@ -1,5 +1,6 @@
 """What the cases are drawn from: numbers that break implementations, and arrays of them."""
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -14,7 +15,7 @@ _ordinary = False
 
 @contextmanager
 def ordinary_numbers(only: bool) -> Iterator[None]:
-    """While this context lasts, and if `only`, `adversarial_numbers` has none that are special, tiny or huge."""
+    """While this context lasts, and if `only`, adversarial numbers and logits are neither special nor tiny nor huge."""
     global _ordinary
     before, _ordinary = _ordinary, only
     try:
@@ -38,6 +39,14 @@ def adversarial_numbers(finite: bool = False) -> st.SearchStrategy[float]:
     if not finite:
         choices.append(st.sampled_from([np.inf, -np.inf, np.nan]))
     return st.one_of(choices)
+
+
+def adversarial_logits() -> st.SearchStrategy[float]:
+    """Ordinary logits, both zeros, a subnormal, ones that are far apart, and minus infinity; see `ordinary_numbers`."""
+    if _ordinary:
+        return st.one_of(st.sampled_from([0.0, 100.0]), st.integers(-1280, 1280).map(lambda n: n / 64))
+    special = st.sampled_from([0.0, -0.0, 1e-45, 100.0, -1e4, 1e30, -1e30, -math.inf])
+    return st.one_of(st.floats(-20, 20, width=32), special)
 
 
 @st.composite
