@@ -12,31 +12,17 @@ import jsonschema
 import numpy as np
 import pytest
 import torch
+from adapters import CHECKS, CONFIG, run
 
 from conformance.adapters.numpy_adapter import NumpyAdapter
 from conformance.adapters.torch_adapter import TorchAdapter
 from conformance.adapters.without_noise import WithoutNoise
 from conformance.candidate import ModuleAdapter
-from conformance.case import Setting
-from conformance.execute import Result, run_check, selected_checks
-from conformance.problems import small_config
 from conformance.serve import load_file
 from impl_torch import world_model
 
 TESTS = Path(__file__).resolve().parent
 DOCUMENT = (TESTS.parent / "docs" / "adapters.md").read_text(encoding="utf-8")
-CHECKS = {check.name: check for check in selected_checks("float64")}
-CONFIG = small_config("paper")  # S = 3, C = 5
-
-
-def module(**functions: Any) -> ModuleAdapter:
-    made = types.ModuleType("mine")
-    vars(made).update(functions)
-    return ModuleAdapter(made, "float64")
-
-
-def run(name: str, adapter: object, dtype: str = "float64") -> Result:
-    return run_check(CHECKS[name], adapter, Setting(dtype, "paper", examples=5))
 
 
 # --- A third-party implementation

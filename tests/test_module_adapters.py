@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from adapters import CHECKS, CONFIG, module, run
 
 from conformance import candidate
 from conformance.adapter import INTERFACE, OBJECTS, RESULTS, Adapter, load_adapter
@@ -17,29 +18,12 @@ from conformance.adapters.numpy_adapter import NumpyAdapter
 from conformance.candidate import ModuleAdapter, remarks
 from conformance.case import Setting
 from conformance.errors import UserError
-from conformance.execute import Result, run_check, selected_checks
+from conformance.execute import run_check
 from conformance.foreign import arranged
-from conformance.problems import small_config
 from conformance.reports import summary
 from conformance.serve import load_file, to_numpy
 from reference_numpy import networks
 from spec import Config
-
-TESTS = Path(__file__).resolve().parent
-DOCUMENT = (TESTS.parent / "docs" / "adapters.md").read_text(encoding="utf-8")
-CHECKS = {check.name: check for check in selected_checks("float64")}
-CONFIG = small_config("paper")  # S = 3, C = 5
-
-
-def module(**functions: Any) -> ModuleAdapter:
-    made = types.ModuleType("mine")
-    vars(made).update(functions)
-    return ModuleAdapter(made, "float64")
-
-
-def run(name: str, adapter: object, dtype: str = "float64") -> Result:
-    return run_check(CHECKS[name], adapter, Setting(dtype, "paper", examples=5))
-
 
 # --- What comes back
 # ------------------------------------------------------------------------------

@@ -25,7 +25,7 @@ EXACT = ("truncated_normal", "dense", "mlp")
 # rounding errors must cancel, what is judged is compiled as it is in training: they depend on what XLA fuses.
 QUICK = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
 OPTIMIZED = {"xla_backend_optimization_level": 3, "xla_cpu_use_fusion_emitters": True}
-CANCELLING = (transforms, distributions, returns)
+CANCELLING = {module.__name__ for module in (transforms, distributions, returns)}
 
 
 class JaxAdapter:
@@ -150,8 +150,7 @@ class JaxAdapter:
         statics = tuple(
             repr(argument) if static else None for argument, static in zip(arguments, is_static, strict=True)
         )
-        cancelling = getattr(function, "__module__", "") in [module.__name__ for module in CANCELLING]
-        options = accepted(OPTIMIZED if cancelling else QUICK) if self.quick else None
+        options = accepted(OPTIMIZED if function.__module__ in CANCELLING else QUICK) if self.quick else None
         compiled = self.compiled.setdefault((key, statics), jax.jit(call, compiler_options=options))
         with jax.default_device(self.device):
             return _to_numpy(compiled(*dynamic))

@@ -29,6 +29,9 @@ def train_steps_by_hand(script: Script) -> None:
         ratio = script.call("ReplayRatio", *case.arguments)
         steps = [ratio(*call.arguments) for call in case.calls]
         script.exact(f"ReplayRatio, {case.name}", steps, [call.expected for call in case.calls])
+    ratio = script.call("ReplayRatio", 32.0, 1024)
+    steps = [ratio(2048 + k) for k in range(65)]
+    script.exact("sixteen workers, step by step", steps, [1, *([0] * 31 + [1]) * 2])
 
 
 @script("LOOP-14", "LOOP-15", uses=["ReplayRatio"], level=0)
