@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from impl_torch.agent import gradients, initial_parameters, policy_step
-from impl_torch.optimizer import clip_flat_gradients_, flat_optimizer, flat_step_
+from impl_torch.optimizer import clip_flat_gradients_, flat_step_, learning_rate
 from impl_torch.parameters import Layout, Parameters
 from impl_torch.rssm import freeze
 from impl_torch.shapes import compute_dtype, require, require_shapes, wide_dtype
@@ -66,7 +66,7 @@ class Learner:
         self._slow_flat = self._critic_flat.clone()
         self._slow_critic = self._critic_layout.views(self._slow_flat)
         self._second_moment, self._momentum, self._gradient = (torch.zeros_like(self._flat) for _ in range(3))
-        self._set_step(0)
+        self._step = 0  # updates that were made
         self._low, self._high = torch.zeros((2,), dtype=self._dtype, device=self._device).unbind()
         # The parameters as the policy uses them, with kernels in the compute dtype; until the next train step.
         self._acting: Mapping[str, Tensor] | None = None
@@ -193,7 +193,7 @@ class Learner:
             flat.zero_()  # the gaps between the tensors too
         for name, x in tensors.items():
             x.copy_(torch.tensor(np.asarray(state[name])))
-        self._set_step(int(state["optimizer/step"]))
+        self._step = int(state["optimizer/step"])
         self._acting = None
         self._stopped = False
 
@@ -226,12 +226,13 @@ class Learner:
     def _update(self, return_range: tuple[Tensor, Tensor]) -> Tensor:
         """The whole training state takes the step of the clipped gradients; the norm of the parameters' movement."""
         config = self.config
-        flat_step_(self._optimizer, self._flat, self._gradient, config)
+        flat_step_(self._flat, self._gradient, self._second_moment, self._momentum, self._step, config)
         self._slow_flat.lerp_(self._critic_flat, 1 - config.slow_critic_decay)  # after the step: [BEH-21]
         self._low, self._high = return_range
         self._acting = None
         # The update is the momentum times this number, and the momentum is still there.
-        rate = self._optimizer.param_groups[0]["lr"]
+        rate = learning_rate(self._step, config)
+        self._step += 1
         return torch.linalg.vector_norm(self._momentum) * (rate / (1 - config.beta1**self._step))
 
     def _tensors(self) -> dict[str, Tensor]:
@@ -244,13 +245,6 @@ class Learner:
             "return_range/": {"low": self._low, "high": self._high},
         }
         return {prefix + name: x for prefix, tree in trees.items() for name, x in tree.items()}
-
-    @property
-    def _step(self) -> int:
-        return self._optimizer.state[self._flat]["step"]
-
-    def _set_step(self, step: int) -> None:
-        self._optimizer = flat_optimizer(self._flat, self._second_moment, self._momentum, step, self.config)
 
     def _to_device(self, x: np.ndarray) -> Tensor:
         tensor = torch.as_tensor(np.ascontiguousarray(x))

@@ -190,17 +190,19 @@ class LaProp(torch.optim.Optimizer):
                 **{name: torch.zeros_like(parameter, dtype=dtype) for name in ("second_moment", "momentum")},
             }
         tensors = (gradient.to(state["momentum"].dtype), state["second_moment"], state["momentum"], parameter)
-        chunks: Iterable[Any] = _chunks(*tensors) if parameter.device.type == "cpu" else [tensors]
-        for chunk in chunks:
-            _laprop_(chunk, state["step"], group["betas"], group["eps"], group["lr"])
+        _laprop_in_chunks_(tensors, state["step"], group["betas"], group["eps"], group["lr"])
         state["step"] += 1
 
 
-def _chunks(*tensors: Tensor) -> Iterable[Any]:
-    """Pieces of CHUNK numbers, where memory allows to walk through the tensors as through vectors."""
-    if not all(x.is_contiguous() for x in tensors):
-        return [tensors]
-    return zip(*(x.view(-1).split(CHUNK) for x in tensors), strict=True)
+def _laprop_in_chunks_(
+    tensors: tuple[Tensor, Tensor, Tensor, Tensor], step: int, betas: tuple[float, float], epsilon: float, rate: float
+) -> None:
+    """`_laprop_`, on the CPU a piece of the tensors at a time where they lie in memory as vectors do."""
+    chunks: Iterable[Any] = [tensors]
+    if tensors[-1].device.type == "cpu" and all(x.is_contiguous() for x in tensors):
+        chunks = zip(*(x.view(-1).split(CHUNK) for x in tensors), strict=True)
+    for chunk in chunks:
+        _laprop_(chunk, step, betas, epsilon, rate)
 
 
 @torch.no_grad()
@@ -219,23 +221,18 @@ def optimizer_step(
     flat, gradient, second_moment, momentum = (
         layout.pack(tree[name].to(dtype) for name in params) for tree in (params, *trees.values())
     )
-    optimizer = flat_optimizer(flat, second_moment, momentum, step, config)
     clip_flat_gradients_(gradient, flat, layout, config.agc_clip, config.agc_epsilon)
-    flat_step_(optimizer, flat, gradient, config)
+    flat_step_(flat, gradient, second_moment, momentum, step, config)
     moments = {"second_moment": layout.views(second_moment), "momentum": layout.views(momentum)}
     return layout.views(flat), {"step": step + 1, **moments}
 
 
-def flat_optimizer(flat: Tensor, second_moment: Tensor, momentum: Tensor, step: int, config: Config) -> LaProp:
-    """The optimizer of a flat buffer of parameters, with its state in the given buffers."""
-    optimizer = LaProp([flat], config.learning_rate, (config.beta1, config.beta2), config.laprop_epsilon)
-    optimizer.state[flat] = {"step": step, "second_moment": second_moment, "momentum": momentum}
-    return optimizer
-
-
-def flat_step_(optimizer: LaProp, flat: Tensor, gradient: Tensor, config: Config) -> None:
-    """One update of a flat buffer, in place, by a gradient that `clip_flat_gradients_` has clipped."""
-    optimizer.param_groups[0]["lr"] = learning_rate(optimizer.state[flat]["step"], config)
-    flat.grad = gradient  # for this call alone: the buffer of gradients is the learner's
-    optimizer.step()
-    flat.grad = None
+@torch.no_grad()
+def flat_step_(
+    flat: Tensor, gradient: Tensor, second_moment: Tensor, momentum: Tensor, step: int, config: Config
+) -> None:
+    """One update of a flat buffer and its moments [total], in place, by a gradient that `clip_flat_gradients_` has
+    clipped; `step` updates were made before."""
+    _require_betas(config.beta1, config.beta2)
+    tensors, betas = (gradient, second_moment, momentum, flat), (config.beta1, config.beta2)
+    _laprop_in_chunks_(tensors, step, betas, config.laprop_epsilon, learning_rate(step, config))

@@ -38,7 +38,7 @@ from spec import Config, Discrete, Image, Spaces, Vector
 
 
 def continue_target(is_terminal: Tensor, config: Config) -> Tensor:
-    """1 where life goes on, times gamma if the head is to learn it: [...] bool -> [...]. [WM-7]"""
+    """1 where the episode continues, times gamma if the head is to learn it: [...] bool -> [...]. [WM-7]"""
     scale = config.discount if config.continue_target == "discounted" else 1.0
     return scale * (1 - is_terminal.to(wide_dtype(config)))
 

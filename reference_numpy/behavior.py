@@ -147,7 +147,7 @@ def actor_loss(log_prob: Any, entropy: Any, returns: Any, value: Any, weight: An
     """The Reinforce loss with entropy regularizer.
     Implements [BEH-9] to [BEH-11], [BEH-17], [BEH-18], [BEH-22] to [BEH-24].
 
-    Paper: section Actor learning, the loss with its sign mended; D-09, D-60, D-61.
+    Paper: section Actor learning, the loss with its sign corrected; D-09, D-60, D-61.
 
     Args:
       log_prob, entropy: [N, H], nats; the gradient passes through these two only.

@@ -18,11 +18,11 @@ Array = NDArray[np.float64]
 def lambda_return(reward: Any, continue_: Any, value: Any, discount: float, lambda_: float) -> Array:
     """The λ-return of every imagined state but the last. Implements [RET-1] to [RET-4], [RET-17] to [RET-20].
 
-    Paper: section Critic learning, equation of the critic loss with its indices mended; D-03, D-04.
+    Paper: section Critic learning, equation of the critic loss with its indices corrected; D-03, D-04.
 
     Args:
       reward: [N, H+1], units of reward; entry t arrived with state t, entry 0 is not used.
-      continue_: [N, H+1], probability that life goes on from state t; entry 0 is not used.
+      continue_: [N, H+1], probability that the episode continues from state t; entry 0 is not used.
       value: [N, H+1], units of reward, the live critic's mean; entry 0 is not used.
       discount: `config.imagined_discount`.
       lambda_: `config.return_lambda`.

@@ -20,7 +20,7 @@ from dreamer_spec.disk import checkpoint
 from dreamer_spec.replay import Replay
 
 ROOT = Path(__file__).parent.parent
-STEPS = 500
+STEPS, CAPACITY = 320, 200
 SMALL = {
     **{"deter": 16, "units": 8, "stoch": 4, "classes": 4, "bins": 15, "envs": 2},
     **{"batch_size": 2, "batch_length": 8, "imagination_horizon": 3},
@@ -32,8 +32,8 @@ pytestmark = pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGKILL"
 
 def command(backend: str, logdir: Path, *more: str) -> list[str]:
     sizes = [word for name, value in SMALL.items() for word in (f"--{name.replace('_', '-')}", str(value))]
-    run = f"--task gym:CartPole-v1 --steps {STEPS} --seed 3 --no-preflight --device cpu --replay-ratio 8"
-    schedule = "--log-every 0 --eval-every 300 --eval-episodes 2 --random-episodes 2 --replay-capacity 300"
+    run = f"--task gym:CartPole-v1 --steps {STEPS} --seed 3 --no-preflight --device cpu --replay-ratio 5"
+    schedule = f"--log-every 0 --eval-every 200 --eval-episodes 2 --random-episodes 2 --replay-capacity {CAPACITY}"
     python = [sys.executable, "-m", "dreamer_spec", "--backend", backend, "--logdir", str(logdir)]
     return [*python, *run.split(), *schedule.split(), *sizes, *more]
 
@@ -67,7 +67,7 @@ def assert_same_run(logdir: Path, other: Path) -> None:
     assert metrics(logdir) == metrics(other)
     states = []
     for run, path in zip(runs, (logdir, other), strict=True):
-        capacity, length, classes = 300, SMALL["batch_length"], SMALL["classes"]
+        capacity, length, classes = CAPACITY, SMALL["batch_length"], SMALL["classes"]
         replay = Replay.restore(
             path / "replay", run.info["replay"], capacity, length, continue_streams=True, classes=classes
         )
@@ -104,7 +104,7 @@ def kill_and_resume(backend: str, kills: int, folder: Path, seed: int) -> int:
 @pytest.mark.covers("LOOP-21", "LOOP-22", "LOOP-23", "REP-29", "REP-33")
 @pytest.mark.parametrize("backend", ["jax", "torch"])
 def test_a_killed_run_continues_bit_by_bit(backend: str, tmp_path: Path) -> None:
-    assert kill_and_resume(backend, 3, tmp_path, seed=0) > 0
+    assert kill_and_resume(backend, 2, tmp_path, seed=0) > 0
 
 
 @pytest.mark.slow
@@ -143,7 +143,7 @@ def test_a_closed_terminal_saves_and_leaves(tmp_path: Path) -> None:
     more."""
     call, output = command("torch", tmp_path / "run", "--checkpoint-every", "1e9"), tmp_path / "output.txt"
     log = tmp_path / "run" / "metrics.jsonl"
-    assert start([sys.executable, "-c", HANG_UP, str(log), "20000", *call], output).wait() == 130, output.read_text()
+    assert start([sys.executable, "-c", HANG_UP, str(log), "10000", *call], output).wait() == 130, output.read_text()
     finish(call, output)
     assert "continuing at step" in output.read_text()
     finish(command("torch", tmp_path / "whole", "--checkpoint-every", "1e9"), tmp_path / "whole.txt")
@@ -156,7 +156,7 @@ def test_a_signal_saves_and_leaves(tmp_path: Path) -> None:
         tmp_path / "output.txt",
         tmp_path / "run" / "metrics.jsonl",
     )
-    for number, size in ((signal.SIGTERM, 20_000), (signal.SIGINT, 120_000)):
+    for number, size in ((signal.SIGTERM, 10_000), (signal.SIGINT, 50_000)):
         process = start(call, output)
         while not log.exists() or log.stat().st_size < size:
             assert process.poll() is None, output.read_text()
