@@ -352,6 +352,9 @@ class Adapter(Protocol):
     ) -> tuple[Nested, Nested]:
         """`train_step` with given samples in place of the noise: see `losses_given`."""
 
+    # The object that is trained, with its own noise and caches.
+    def Learner(self, spaces: Spaces, config: Config, seed: int) -> "Learner": ...  # noqa: N802
+
     # replay and training loop: shared by all backends. The classes have the constructors and methods of the
     # reference's.
     def Replay(self, capacity: int, length: int) -> Any: ...  # noqa: N802
@@ -363,6 +366,32 @@ class Adapter(Protocol):
     ) -> Arrays: ...
     def environment_action(self, action: Array, spaces: Spaces, low: Arrays, high: Arrays) -> Arrays: ...
     def derive_seed(self, seed: int, purpose: str, index: int) -> int: ...
+
+
+class Learner(Protocol):
+    """An agent and its optimizer in training. A seed says which random numbers a step draws."""
+
+    def state_dict(self) -> Arrays:
+        """The training state under its canonical names [AGT-9]."""
+
+    def load_state_dict(self, state: Arrays) -> None:
+        """Takes over a training state."""
+
+    def train_step(self, batch: Arrays, seed: int) -> tuple[Arrays, Arrays]:
+        """One update. Returns metrics, of them "loss/NAME" of every loss, and the latents {"deter" [B, T, D], "stoch"
+        [B, T, S] class indices}."""
+
+    def initial_carry(self, envs: int) -> Any:
+        """The carry of environments before their first step; opaque."""
+
+    def policy(self, observation: Arrays, is_first: Array, carry: Any, seed: int) -> tuple[Array, Arrays, Any]:
+        """One acting step of N environments: action [N, A], latents {"deter" [N, D], "stoch" [N, S]}, carry."""
+
+    def train_noise(self, batch: Arrays, seed: int) -> Arrays:
+        """The noise that `train_step` draws with this seed [CON-20]."""
+
+    def policy_noise(self, envs: int, seed: int) -> Arrays:
+        """The noise that `policy` draws with this seed: "posterior" [N, S] and "action" [N, K] [CON-19]."""
 
 
 class Hooks(Protocol):
@@ -386,7 +415,7 @@ INTERFACE: dict[str, tuple[str, ...]] = {
 }
 """Every function that the checks know -> the names of its arguments, which are given by position."""
 
-OBJECTS = ("Replay", "ReplayRatio")
+OBJECTS = ("Learner", "Replay", "ReplayRatio")
 """Functions of the interface that return objects with methods, and no numbers."""
 
 RESULTS: dict[str, tuple[str, ...]] = {

@@ -26,6 +26,34 @@ ACTIONS: dict[str, dict[str, Vector | Discrete]] = {
     "continuous": {"action": Vector(3)},
     "mixed": {"arm": Vector(2), "buttons": Discrete((2, 3))},
 }
+# Choices of every option that changes what is computed, other than those of the profiles.
+OPTIONS: dict[str, tuple[Any, ...]] = {
+    **{"units": (8, 12), "deter": (16, 24), "stoch": (2, 3), "classes": (4, 6), "blocks": (1, 2, 4), "bins": (15, 41)},
+    **{"cnn_sampling": ("strided", "pooled"), "cnn_outer": (True, False), "cnn_depth": (4, 8)},
+    "cnn_multipliers": ((1, 2), (2, 1, 3)),
+    **{f"{part}_layers": (1, 2, 3) for part in ("encoder", "decoder", "posterior", "prior", "reward")},
+    **{f"{part}_layers": (1, 2, 3) for part in ("continue", "actor", "critic")},
+    **{"norm_epsilon": (1e-5, 1e-2), "latent_unimix": (0.0, 0.3), "actor_unimix": (0.0, 0.3)},
+    **{"actor_min_std": (0.05, 0.5), "actor_max_std": (1.0, 2.5), "vector_loss_scale": (0.5, 1.0)},
+    **{"free_nats": (0.0, 0.5, 2.0), "continue_target": ("hard", "discounted"), "discount_horizon": (5.0, 1000.0)},
+    **{"start_continue": ("true", "predicted"), "return_lambda": (0.0, 0.6, 1.0), "entropy_scale": (0.0, 0.1)},
+    **{"slow_critic_scale": (0.0, 0.5), "return_limit": (0.1, 3.0), "return_decay": (0.0, 0.5, 1.0)},
+    **{"return_percentile_low": (0.0, 30.0), "return_percentile_high": (60.0, 100.0)},
+    **{f"{name}_scale": (0.3, 2.0) for name in ("reconstruction", "reward", "continue", "dynamics")},
+    **{f"{name}_scale": (0.3, 2.0) for name in ("representation", "actor", "critic", "replay_critic")},
+}
+OBSERVED = (
+    {"image": Image(16, 32, 3)},
+    {"mode": Discrete((3, 2)), "position": Vector(3)},
+    {"depth": Image(32, 16, 1), "image": Image(32, 16, 3)},
+    {"board": Discrete((2, 4)), "depth": Image(16, 16, 2), "place": Vector(1), "speed": Vector(2)},
+)
+ACTING = (
+    {"action": Discrete((5,))},
+    {"arm": Vector(2), "buttons": Discrete((2, 3)), "leg": Vector(1)},
+    {"action": Vector(3)},
+    {"action": Discrete((3, 2, 4))},
+)
 SMALL = {
     "units": 8,
     "deter": 16,
@@ -193,8 +221,12 @@ def random_state(rng: np.random.Generator, config: Config, task: Spaces, dtype: 
 def make_problem(
     seed: int, profile: str, observation: str, action: str, dtype: str = "float64", **overrides: Any
 ) -> Problem:
-    rng = np.random.default_rng(seed)
-    config, task = small_config(profile, dtype, **overrides), spaces(observation, action)
+    return problem_in(spaces(observation, action), seed, profile, dtype, **overrides)
+
+
+def problem_in(task: Spaces, seed: int, profile: str, dtype: str = "float64", **overrides: Any) -> Problem:
+    """A training step in the middle of training, with the spaces of a task."""
+    rng, config = np.random.default_rng(seed), small_config(profile, dtype, **overrides)
     return Problem(
         task,
         config,
@@ -202,6 +234,18 @@ def make_problem(
         random_batch(rng, config, task),
         train_noise(rng, config, task),
     )
+
+
+def unusual_problem(seed: int, number: int, profile: str, dtype: str) -> Problem:
+    """The one of a number among those of a seed: every kind of observation and of action occurs among any four numbers,
+    and every option is drawn."""
+    rng = np.random.default_rng([seed, number])
+    task = Spaces(OBSERVED[(seed + number) % len(OBSERVED)], ACTING[(2 * seed + number) % len(ACTING)])
+    overrides = {name: choices[rng.integers(len(choices))] for name, choices in OPTIONS.items()}
+    last = overrides["cnn_multipliers"][-1] * overrides["cnn_depth"]
+    if last % overrides["blocks"] or overrides["deter"] % overrides["blocks"]:
+        overrides["blocks"] = 1
+    return problem_in(task, int(rng.integers(2**31)), profile, dtype, **overrides)
 
 
 def nudged(problem: Problem, distance: float) -> Problem:

@@ -48,19 +48,16 @@ class Learner:
         if config.compute_dtype == "float64":
             jax.config.update("jax_enable_x64", True)
         self.spaces, self.config, self._nonfinite = spaces, config, nonfinite
+        self._programs = _programs(_Static(spaces, config))
         if threads:
             # XLA has no other way to say it, and looks when it makes the client of the CPU.
             os.environ["NPROC"] = str(threads)
         self._device = select_device(device)
         self.device = ":".join([self._device.platform, *(device or "").split(":")[1:]])
         with jax.default_device(self._device):
-            state = jax.jit(_initial_state, static_argnums=1)(np.uint32(seed), _Static(spaces, config))
+            state = self._programs.initial_state(np.uint32(seed))
         self._state = jax.device_put(state, self._device)
         self._stopped = self._flag(False)  # on the device: no train step waits for the one before
-        self._policy = jax.jit(self._policy_function, static_argnames="mode")
-        self._train = jax.jit(self._train_function, donate_argnums=0)  # the new state takes the memory of the old one
-        self._gradients = jax.jit(self._gradients_function)
-        self._predict = jax.jit(self._predict_function, static_argnums=4)
         flags = ("reward", "is_first", "is_last", "is_terminal")
         self._batch_keys = (*spaces.observations, *flags, "prev_action", "deter", "stoch")
 
@@ -101,7 +98,7 @@ class Learner:
         """
         inputs = {key: np.asarray(observation[key]) for key in self.spaces.observations if key in observation}
         inputs = jax.device_put((inputs, np.asarray(is_first, bool)), self._device)
-        carry, latents = self._policy(self._state["params"], carry, *inputs, np.uint32(seed), mode=mode)
+        carry, latents = self._programs.policy(self._state["params"], carry, *inputs, np.uint32(seed), mode=mode)
         return np.asarray(carry["action"]), latents, carry
 
     def train_step(self, batch: Arrays, seed: int) -> tuple[Mapping[str, Any], Arrays]:
@@ -110,14 +107,16 @@ class Learner:
         Returns metrics by name and the latents to write back, which may still be computing.
         """
         inputs = self._inputs(batch)
-        self._state, skipped, metrics, latents = self._train(self._state, self._stopped, inputs, np.uint32(seed))
+        self._state, skipped, metrics, latents = self._programs.train(
+            self._state, self._stopped, inputs, np.uint32(seed)
+        )
         if self._nonfinite == "stop":
             self._stopped = skipped
         return {name: _Element(metrics.values, index) for index, name in enumerate(metrics.names)}, latents
 
     def gradients(self, batch: Arrays, seed: int) -> tuple[dict[str, float], dict[str, np.ndarray]]:
         """Metrics and gradients by name, as a train step would compute them now. Changes nothing. [LOOP-44]"""
-        metrics, gradients = self._gradients(self._state, self._inputs(batch), np.uint32(seed))
+        metrics, gradients = self._programs.gradients(self._state, self._inputs(batch), np.uint32(seed))
         numbers = dict(zip(metrics.names, np.asarray(metrics.values).tolist(), strict=True))
         return numbers, {name: np.array(gradient) for name, gradient in gradients.items()}
 
@@ -131,8 +130,23 @@ class Learner:
         observed = {key: np.asarray(observation[key]) for key in self.spaces.observations if key in observation}
         arrays = (observed, np.asarray(prev_action), np.asarray(is_first, bool))
         inputs, prev_action, is_first = jax.device_put(arrays, self._device)
-        predictions = self._predict(self._state["params"], inputs, prev_action, is_first, context, np.uint32(seed))
+        predictions = self._programs.predict(
+            self._state["params"], inputs, prev_action, is_first, context, np.uint32(seed)
+        )
         return {key: np.asarray(value) for key, value in predictions.items()}
+
+    def train_noise(self, batch: Arrays, seed: int) -> dict[str, np.ndarray]:
+        """The random numbers of `train_step` with this seed: posterior [B, T, S], prior [B*T, H, S], action [B*T, H,
+        K]. [CON-20]"""
+        with jax.default_device(self._device):
+            noise = self._programs.train_noise(np.shape(batch["is_first"]), np.uint32(seed))
+        return {name: np.asarray(x) for name, x in noise.items()}
+
+    def policy_noise(self, envs: int, seed: int) -> dict[str, np.ndarray]:
+        """The random numbers of `policy` with this seed: posterior [N, S], action [N, K]. [CON-19]"""
+        with jax.default_device(self._device):
+            noise = self._programs.policy_noise(envs, np.uint32(seed))
+        return {name: np.asarray(x) for name, x in noise.items()}
 
     def state_dict(self) -> dict[str, np.ndarray]:
         """The training state under its canonical names. [AGT-8], [AGT-9]"""
@@ -159,76 +173,6 @@ class Learner:
         require_keys("batch", batch, self._batch_keys)
         return jax.device_put({key: batch[key] for key in self._batch_keys}, self._device)
 
-    def _policy_function(
-        self, params: Any, carry: Any, observation: Any, is_first: jax.Array, seed: jax.Array, *, mode: bool
-    ) -> tuple[Any, Any]:
-        shape = is_first.shape
-        noise = _noise(seed, {"posterior": (*shape, self.config.stoch)}, shape, self.spaces, self.config)
-        latents = {"deter": carry["deter"], "stoch": carry["stoch"]}
-        latents, action = agent.policy_step(
-            params, latents, carry["action"], observation, is_first, noise, self.spaces, self.config, mode
-        )
-        return latents | {"action": action}, self._stored(latents)
-
-    def _train_function(
-        self, state: Any, stopped: jax.Array, batch: Any, seed: jax.Array
-    ) -> tuple[Any, jax.Array, Any, Any]:
-        new, aux = agent.train_step(state, batch, self._train_noise(batch, seed), self.spaces, self.config)
-        metrics = {f"loss/{name}": mean for name, mean in aux["losses"].items()} | aux["metrics"]
-        # Chosen on the device, so that the host waits for no train step before it starts the next.
-        finite = jnp.isfinite(metrics["loss/total"]) & jnp.isfinite(metrics["gradient_norm"])
-        applied = finite & ~stopped
-        state = jax.tree.map(lambda after, before: jnp.where(applied, after, before), new, state)
-        metrics |= {"update_norm": jnp.where(applied, metrics["update_norm"], 0.0), "skipped": ~applied}
-        return state, ~applied, self._packed(metrics), self._stored(aux)
-
-    def _gradients_function(self, state: Any, batch: Any, seed: jax.Array) -> tuple[Any, dict[str, jax.Array]]:
-        return_range = (state["return_range"]["low"], state["return_range"]["high"])
-        noise = self._train_noise(batch, seed)
-        gradients, total, aux = agent.gradients(
-            state["params"], state["slow_critic"], return_range, batch, noise, self.spaces, self.config
-        )
-        low, high = aux["return_range"]
-        metrics = {f"loss/{name}": mean for name, mean in aux["losses"].items()} | aux["metrics"]
-        metrics |= {"loss/total": total, "return_low": low, "return_high": high}
-        metrics["gradient_norm"] = norm(jnp.stack([norm(gradient) for gradient in gradients.values()]))
-        return self._packed(metrics), gradients
-
-    def _train_noise(self, batch: Any, seed: jax.Array) -> dict[str, jax.Array]:
-        """All random numbers of a step, drawn before its loops, which draw none. [CON-20]"""
-        B, T = batch["is_first"].shape
-        N, H, S = B * T, self.config.imagination_horizon, self.config.stoch
-        uniforms = {"posterior": (B, T, S), "prior": (N, H, S)}
-        return _noise(seed, uniforms, (N, H), self.spaces, self.config)
-
-    def _packed(self, metrics: Mapping[str, jax.Array]) -> "_Metrics":
-        dtype = wide_dtype(self.config)
-        return _Metrics(tuple(metrics), jnp.stack([value.astype(dtype) for value in metrics.values()]))
-
-    def _predict_function(
-        self, params: Any, observation: Any, prev_action: jax.Array, is_first: jax.Array, context: int, seed: jax.Array
-    ) -> dict[str, jax.Array]:
-        (B, T), key = is_first.shape, jax.random.key(seed)
-        shapes = {
-            "posterior": (B, max(0, context), self.config.stoch),
-            "prior": (B, max(0, T - context), self.config.stoch),
-        }
-        dtype = wide_dtype(self.config)
-        noise = {
-            name: jax.random.uniform(jax.random.fold_in(key, i), shape, dtype)
-            for i, (name, shape) in enumerate(shapes.items())
-        }
-        return world_model.open_loop(
-            params, observation, prev_action, is_first, context, noise, self.spaces, self.config
-        )
-
-    def _stored(self, states: Any) -> dict[str, jax.Array]:
-        """Latents as the replay buffer keeps them."""
-        return {
-            "deter": states["deter"].astype(jnp.float32),
-            "stoch": jnp.argmax(states["stoch"], -1).astype(jnp.int32),
-        }
-
 
 @functools.partial(jax.tree_util.register_dataclass, data_fields=["values"], meta_fields=["names"])
 @dataclasses.dataclass(frozen=True)
@@ -253,10 +197,118 @@ class _Element:
 
 
 class _Static:
-    """Spaces and configuration as one hashable argument of a compiled function."""
+    """Spaces and configuration as one hashable argument."""
 
     def __init__(self, spaces: Spaces, config: Config) -> None:
         self.spaces, self.config = spaces, config
+
+    def __hash__(self) -> int:
+        return hash(repr((self.spaces, self.config)))
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Static) and repr((self.spaces, self.config)) == repr((other.spaces, other.config))
+
+
+@functools.lru_cache(maxsize=4)
+def _programs(static: _Static) -> "_Programs":
+    """Shared by the learners of a process that differ in their state alone, so that each is compiled once."""
+    return _Programs(static.spaces, static.config)
+
+
+class _Programs:
+    """The compiled functions of agents with these spaces and this configuration."""
+
+    def __init__(self, spaces: Spaces, config: Config) -> None:
+        self.spaces, self.config = spaces, config
+        self.initial_state = jax.jit(self._initial_state)
+        self.policy = jax.jit(self._policy, static_argnames="mode")
+        self.train = jax.jit(self._train, donate_argnums=0)  # the new state takes the memory of the old one
+        self.gradients = jax.jit(self._gradients)
+        self.predict = jax.jit(self._predict, static_argnums=4)
+        self.train_noise = jax.jit(self._train_noise, static_argnums=0)
+        self.policy_noise = jax.jit(self._policy_noise, static_argnums=0)
+
+    def _initial_state(self, seed: jax.Array) -> dict[str, Any]:
+        table = parameter_table(self.config, self.spaces)
+        kernels = {name: entry.shape for name, entry in table.items() if entry.initializer == "truncated_normal"}
+        # One draw for all kernels, cut up: every draw of its own would be compiled by itself.
+        ends = np.cumsum([math.prod(shape) for shape in kernels.values()])
+        numbers = jax.random.uniform(jax.random.key(seed), (int(ends[-1]),), wide_dtype(self.config))
+        pieces = zip(kernels.items(), jnp.split(numbers, ends[:-1]), strict=True)
+        uniforms = {name: piece.reshape(shape) for (name, shape), piece in pieces}
+        return agent.initial_state(agent.initial_parameters(table, uniforms))
+
+    def _policy(
+        self, params: Any, carry: Any, observation: Any, is_first: jax.Array, seed: jax.Array, *, mode: bool
+    ) -> tuple[Any, Any]:
+        noise = self._policy_noise(len(is_first), seed)
+        latents = {"deter": carry["deter"], "stoch": carry["stoch"]}
+        latents, action = agent.policy_step(
+            params, latents, carry["action"], observation, is_first, noise, self.spaces, self.config, mode
+        )
+        return latents | {"action": action}, self._stored(latents)
+
+    def _train(self, state: Any, stopped: jax.Array, batch: Any, seed: jax.Array) -> tuple[Any, jax.Array, Any, Any]:
+        new, aux = agent.train_step(
+            state, batch, self._train_noise(batch["is_first"].shape, seed), self.spaces, self.config
+        )
+        metrics = {f"loss/{name}": mean for name, mean in aux["losses"].items()} | aux["metrics"]
+        # Chosen on the device, so that the host waits for no train step before it starts the next.
+        finite = jnp.isfinite(metrics["loss/total"]) & jnp.isfinite(metrics["gradient_norm"])
+        applied = finite & ~stopped
+        state = jax.tree.map(lambda after, before: jnp.where(applied, after, before), new, state)
+        metrics |= {"update_norm": jnp.where(applied, metrics["update_norm"], 0.0), "skipped": ~applied}
+        return state, ~applied, self._packed(metrics), self._stored(aux)
+
+    def _gradients(self, state: Any, batch: Any, seed: jax.Array) -> tuple[Any, dict[str, jax.Array]]:
+        return_range = (state["return_range"]["low"], state["return_range"]["high"])
+        noise = self._train_noise(batch["is_first"].shape, seed)
+        gradients, total, aux = agent.gradients(
+            state["params"], state["slow_critic"], return_range, batch, noise, self.spaces, self.config
+        )
+        low, high = aux["return_range"]
+        metrics = {f"loss/{name}": mean for name, mean in aux["losses"].items()} | aux["metrics"]
+        metrics |= {"loss/total": total, "return_low": low, "return_high": high}
+        metrics["gradient_norm"] = norm(jnp.stack([norm(gradient) for gradient in gradients.values()]))
+        return self._packed(metrics), gradients
+
+    def _policy_noise(self, envs: int, seed: jax.Array) -> dict[str, jax.Array]:
+        return _noise(seed, {"posterior": (envs, self.config.stoch)}, (envs,), self.spaces, self.config)
+
+    def _train_noise(self, shape: tuple[int, ...], seed: jax.Array) -> dict[str, jax.Array]:
+        """All random numbers of a step, drawn before its loops, which draw none. [CON-20]"""
+        B, T = shape
+        N, H, S = B * T, self.config.imagination_horizon, self.config.stoch
+        uniforms = {"posterior": (B, T, S), "prior": (N, H, S)}
+        return _noise(seed, uniforms, (N, H), self.spaces, self.config)
+
+    def _packed(self, metrics: Mapping[str, jax.Array]) -> "_Metrics":
+        dtype = wide_dtype(self.config)
+        return _Metrics(tuple(metrics), jnp.stack([value.astype(dtype) for value in metrics.values()]))
+
+    def _predict(
+        self, params: Any, observation: Any, prev_action: jax.Array, is_first: jax.Array, context: int, seed: jax.Array
+    ) -> dict[str, jax.Array]:
+        (B, T), key = is_first.shape, jax.random.key(seed)
+        shapes = {
+            "posterior": (B, max(0, context), self.config.stoch),
+            "prior": (B, max(0, T - context), self.config.stoch),
+        }
+        dtype = wide_dtype(self.config)
+        noise = {
+            name: jax.random.uniform(jax.random.fold_in(key, i), shape, dtype)
+            for i, (name, shape) in enumerate(shapes.items())
+        }
+        return world_model.open_loop(
+            params, observation, prev_action, is_first, context, noise, self.spaces, self.config
+        )
+
+    def _stored(self, states: Any) -> dict[str, jax.Array]:
+        """Latents as the replay buffer keeps them."""
+        return {
+            "deter": states["deter"].astype(jnp.float32),
+            "stoch": jnp.argmax(states["stoch"], -1).astype(jnp.int32),
+        }
 
 
 def select_device(name: str | None) -> jax.Device:
@@ -280,17 +332,6 @@ def select_device(name: str | None) -> jax.Device:
     if index >= len(devices):
         raise ValueError(f"JAX finds no device {name!r} here: there are {len(devices)} GPUs, counted from 0")
     return devices[index]
-
-
-def _initial_state(seed: jax.Array, static: _Static) -> dict[str, Any]:
-    table = parameter_table(static.config, static.spaces)
-    kernels = {name: entry.shape for name, entry in table.items() if entry.initializer == "truncated_normal"}
-    # One draw for all kernels, cut up: every draw of its own would be compiled by itself.
-    ends = np.cumsum([math.prod(shape) for shape in kernels.values()])
-    numbers = jax.random.uniform(jax.random.key(seed), (int(ends[-1]),), wide_dtype(static.config))
-    pieces = zip(kernels.items(), jnp.split(numbers, ends[:-1]), strict=True)
-    uniforms = {name: piece.reshape(shape) for (name, shape), piece in pieces}
-    return agent.initial_state(agent.initial_parameters(table, uniforms))
 
 
 def _noise(

@@ -103,11 +103,7 @@ class Learner:
         observation {key: [N, ...]}, is_first [N]; mode: the action is the mode of the actor, [LOOP-71].
         The latents {"deter" [N, D], "stoch" [N, S] class indices} may still be on their way.
         """
-        generator = self._generator(seed)
-        noise = {
-            "posterior": self._uniform(generator, len(is_first), self.config.stoch),
-            "action": self._action_noise(generator, len(is_first)),
-        }
+        noise = self._policy_noise(len(is_first), seed)
         if self._acting is None:
             self._acting = freeze(self.parameters.mapping(), self.config)
         inputs = {key: self._to_device(observation[key]) for key in self.spaces.observations}
@@ -174,6 +170,15 @@ class Learner:
         )
         return {key: value.cpu().numpy() for key, value in predictions.items()}
 
+    def train_noise(self, batch: Arrays, seed: int) -> dict[str, np.ndarray]:
+        """The random numbers of `train_step` with this seed: posterior [B, T, S], prior [B*T, H, S], action [B*T, H,
+        K]. [CON-20]"""
+        return {name: x.cpu().numpy() for name, x in self._train_noise(np.shape(batch["reward"]), seed).items()}
+
+    def policy_noise(self, envs: int, seed: int) -> dict[str, np.ndarray]:
+        """The random numbers of `policy` with this seed: posterior [N, S], action [N, K]. [CON-19]"""
+        return {name: x.cpu().numpy() for name, x in self._policy_noise(envs, seed).items()}
+
     def state_dict(self) -> dict[str, np.ndarray]:
         """The training state under its canonical names, as copies. [AGT-8] [AGT-9]"""
         state = {name: x.detach().cpu().numpy().copy() for name, x in self._tensors().items()}
@@ -203,7 +208,7 @@ class Learner:
         """(gradients, metrics, factors of the clipping [P], aux); leaves the clipped gradients in `_gradient`."""
         config = self.config
         inputs = {name: self._to_device(x) for name, x in batch.items()}
-        noise, return_range = self._train_noise(inputs, seed), (self._low, self._high)
+        noise, return_range = self._train_noise(inputs["reward"].shape, seed), (self._low, self._high)
         by_name, total, aux = gradients(
             self.parameters.mapping(), self._slow_critic, return_range, inputs, noise, self.spaces, config
         )
@@ -267,10 +272,17 @@ class Learner:
             parts.append(draw(*leading, *space.array_shape, **where))
         return torch.cat(parts, -1)
 
-    def _train_noise(self, batch: Mapping[str, Tensor], seed: int) -> dict[str, Tensor]:
+    def _policy_noise(self, envs: int, seed: int) -> dict[str, Tensor]:
+        generator = self._generator(seed)
+        return {
+            "posterior": self._uniform(generator, envs, self.config.stoch),
+            "action": self._action_noise(generator, envs),
+        }
+
+    def _train_noise(self, shape: tuple[int, ...], seed: int) -> dict[str, Tensor]:
         """All random numbers of a step, drawn on the device before its loops, which draw none. [CON-20]"""
         generator = self._generator(seed)
-        (B, T), H, S = batch["reward"].shape, self.config.imagination_horizon, self.config.stoch
+        (B, T), H, S = shape, self.config.imagination_horizon, self.config.stoch
         return {
             "posterior": self._uniform(generator, B, T, S),
             "prior": self._uniform(generator, B * T, H, S),

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from impl_jax import agent, behavior, distributions, layers, networks, optimizer, returns, rssm, transforms, world_model
-from impl_jax.learner import select_device
+from impl_jax.learner import Learner, select_device
 from spec import Config, Spaces
 
 CHAPTERS = (transforms, distributions, layers, rssm, networks, world_model, returns, behavior, optimizer, agent)
@@ -25,6 +25,9 @@ EXACT = ("truncated_normal", "dense", "mlp")
 # rounding errors must cancel, what is judged is compiled as it is in training: they depend on what XLA fuses.
 QUICK = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
 OPTIMIZED = {"xla_backend_optimization_level": 3, "xla_cpu_use_fusion_emitters": True}
+# From so many time steps on, the gradient of the total alone is compiled apart from those of every loss: it takes a
+# tenth of the time, which for small batches is less than compiling.
+LARGE = 64
 CANCELLING = {module.__name__ for module in (transforms, distributions, returns)}
 
 
@@ -83,6 +86,9 @@ class JaxAdapter:
         x = self._cast(x, jnp.bfloat16 if self.dtype == "bfloat16" else None)
         return self._run(lambda params, x: function(params, name, x, *rest), (key, name, *rest), None, params, x)
 
+    def Learner(self, spaces: Spaces, config: Config, seed: int) -> Learner:  # noqa: N802
+        return Learner(spaces, self._config(config), seed=seed, device=self.device.platform)
+
     def imagine(self, params: Any, carry: Any, action: Any, uniform: Any, config: Config) -> Any:
         def function(params: Any, carry: Any, action: Any, uniform: Any, config: Config) -> Any:
             return rssm.imagine(params, carry, lambda feature, t: action[:, t], uniform, config)
@@ -102,6 +108,8 @@ class JaxAdapter:
         )
 
     def gradients(self, *inputs: Any) -> Any:
+        if inputs[3]["reward"].size >= LARGE:
+            return self._run(lambda *inputs: agent.gradients(*inputs)[0], "gradients of the total", None, *inputs)
         return self._gradients(*inputs)["total"]
 
     def loss_derivatives(self, *arguments: Any) -> dict[str, np.ndarray]:

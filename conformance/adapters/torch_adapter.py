@@ -20,9 +20,9 @@ from impl_torch import (
     transforms,
     world_model,
 )
-from impl_torch.learner import select_device
+from impl_torch.learner import Learner, select_device
 from impl_torch.shapes import DTYPES
-from spec import Config
+from spec import Config, Spaces
 
 CHAPTERS = (transforms, distributions, layers, rssm, networks, world_model, returns, behavior, optimizer, agent)
 ARRAYS = (torch.Tensor, transforms.Bins)
@@ -47,6 +47,9 @@ class TorchAdapter:
             if not name.startswith("_") and getattr(function, "__module__", None) == chapter.__name__:
                 return self._wrap(function, narrow=chapter in NARROW and name != "truncated_normal")
         raise AttributeError(name)
+
+    def Learner(self, spaces: Spaces, config: Config, seed: int) -> Learner:  # noqa: N802
+        return Learner(spaces, self._enter(config), seed=seed, device=self._device.type)
 
     def imagine(self, params: Any, carry: Any, action: np.ndarray, uniform: np.ndarray, config: Config) -> Any:
         actions = self._enter(action)

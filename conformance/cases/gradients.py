@@ -3,19 +3,23 @@ differentiation go wrong."""
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from conformance.case import Cases, Equal, Setting, judged, related
-from conformance.cases.agent import SAMPLING_MARGIN, WHOLE, bound_of
+from conformance.cases.agent import SAMPLING_MARGIN, WHOLE, Example, bound_of
+from conformance.cases.losses import demands_of
 from conformance.check import check
 from conformance.compare import Comparisons
-from conformance.problems import Problem, make_problem, with_sampling_margin
+from conformance.problems import Problem, make_problem, unusual_problem, with_sampling_margin
+from conformance.settled import settled
 from reference_numpy import agent
 from reference_numpy.transforms import exponential_bins, twohot
 from reference_numpy.world_model import continue_target
 
+UNUSUAL = 4  # problems with drawn options in a run of the checks
 MASKED = ("rssm/posterior/out/bias", "rssm/prior/out/bias", "actor/out/buttons/logits/bias")
 
 
@@ -139,3 +143,60 @@ def the_first_of_equal_pixels_has_the_gradient(setting: Setting) -> Cases:
         changed = dataclasses.replace(problem, state=state, batch=batch)
         calls.append(("gradients", changed.loss_arguments))
     yield related(same, *calls)
+
+
+@functools.lru_cache(maxsize=32)
+def unusual_example(seed: int, number: int, profile: str, dtype: str) -> Example:
+    """In bfloat16 rounding could change a sample, or whether the free nats clip a time step: there every uniform number
+    lies in the middle of the likeliest class, and nothing is clipped."""
+    problem = unusual_problem(seed, number, profile, dtype)
+    if dtype == "bfloat16":
+        problem = dataclasses.replace(problem, config=dataclasses.replace(problem.config, free_nats=0.0))
+    return Example(settled(problem, 1.0 if dtype == "bfloat16" else SAMPLING_MARGIN), seed)
+
+
+OPTIONS = ("AGT-15", "AGT-26", "AGT-27", "NET-1", "WM-1", "BEH-10", "CON-4")
+
+
+@check(*OPTIONS, uses=["losses"], level=2, dtypes=WHOLE)
+def losses_with_unusual_options_match(setting: Setting) -> Cases:
+    """Losses, metrics and latents where every option is drawn, for images alone, several images, vectors alone, and
+    every kind of action."""
+    for number in range(UNUSUAL):
+        example = unusual_example(setting.seed, number, setting.profile, setting.dtype)
+        demands = demands_of(example, f"options {number}: ", bound_of(setting, 1e-9, 2e-4))
+        yield judged("losses", example.problem.loss_arguments, *demands.values())
+
+
+@check("AGT-28", "AGT-32", "CON-14", "CON-23", "NET-25", uses=["gradients"], level=2)
+def every_tensor_has_its_gradient(setting: Setting) -> Cases:
+    """The gradient of every tensor along itself and along random signs, in every precision, where every option is
+    drawn: its length is right then, and so is its angle."""
+    bound = {"float64": 1e-5, "float32": 1e-3, "bfloat16": 0.3}[setting.dtype]
+    # In bfloat16 layer by layer: a sum over more would hide one tensor behind the rounding of the others.
+    group = (lambda name: name.rpartition("/")[0]) if setting.dtype == "bfloat16" else (lambda name: name.split("/")[0])
+    for number in range(UNUSUAL):
+        example = unusual_example(setting.seed, number, setting.profile, setting.dtype)
+        relation = functools.partial(by_group, example, group, f"options {number}", bound)
+        yield judged("gradients", example.problem.loss_arguments, relation)
+
+
+def by_group(
+    example: Example, group: Callable[[str], str], where: str, bound: float, c: Comparisons, gradients: Any
+) -> None:
+    """The relation of gradients to derivatives of the total: one number for each group, to which each of its tensors
+    contributes alike, however long its gradient is."""
+    rng = np.random.default_rng(example.seed)
+    found = {name: np.asarray(gradients[name], np.float64) for name in example.problem.state["params"]}
+    least = 1e-3 * np.sqrt(sum(float((x**2).sum()) for x in found.values()))
+    for label in dict.fromkeys(map(group, found)):
+        along = {}
+        for name in [name for name in found if group(name) == label]:
+            size = max(float(np.linalg.norm(found[name])), least)
+            signs = rng.choice([-1.0, 1.0], found[name].shape)
+            along[name] = (found[name] / size + signs / np.sqrt(signs.size)) / size
+        length = np.sqrt(sum(float((x**2).sum()) for x in along.values()))
+        product = sum(float((found[name] * x).sum()) for name, x in along.items()) / length
+        derivative = example.total_derivative({name: x / length for name, x in along.items()})
+        what = f"{where}: gradient of {label}"
+        c.compare(what, product, derivative, magnitude=max(len(along) / length, abs(derivative)), bound=bound)

@@ -56,6 +56,7 @@ def demands_of(example: Example, where: str, bound: float) -> dict[str, Equal]:
     """What every output must be, by its name."""
     total, aux = example.losses
     size, range_ = loss_magnitude(aux), np.array(aux["return_range"])
+    reach = max(1.0, float(np.abs(range_).max()))
     means = {
         name: Equal(mean, (1, group, name), where=where + name, magnitude=size, bound=bound)
         for group in ("losses", "metrics")
@@ -64,7 +65,7 @@ def demands_of(example: Example, where: str, bound: float) -> dict[str, Equal]:
     deter, stoch = latents_are(aux, where, bound)
     return {
         "total": Equal(total, (0,), where=f"{where}total", bound=bound),
-        "return_range": Equal(range_, (1, "return_range"), where=f"{where}return_range", magnitude=1.0, bound=bound),
+        "return_range": Equal(range_, (1, "return_range"), where=f"{where}return_range", magnitude=reach, bound=bound),
         "deter": deter,
         "stoch": stoch,
         **means,

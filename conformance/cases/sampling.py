@@ -140,10 +140,11 @@ def tests_of(sizes: list[int]) -> int:
 def compare_groups(script: Script, where: str, groups: dict[str, Group], level: float) -> None:
     """The frequency of every class of every group, and of every pair of classes of neighbouring groups."""
     for label, (onehot, probs) in groups.items():
-        within(script, f"{where}frequencies of {label}", onehot.mean(0), probs, frequency_radius(probs, SAMPLES, level))
+        radius = frequency_radius(probs, len(onehot), level)
+        within(script, f"{where}frequencies of {label}", onehot.mean(0), probs, radius)
     for (a, (left, p)), (b, (right, q)) in itertools.pairwise(groups.items()):
-        both, found = np.outer(p, q), left.T @ right / SAMPLES
-        within(script, f"{where}{a} together with {b}", found, both, frequency_radius(both, SAMPLES, level))
+        both, found = np.outer(p, q), left.T @ right / len(left)
+        within(script, f"{where}{a} together with {b}", found, both, frequency_radius(both, len(left), level))
 
 
 def compare_normal(script: Script, where: str, z: np.ndarray, level: float) -> None:

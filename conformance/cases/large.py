@@ -1,0 +1,134 @@
+"""Checks at the size of a training batch, and where axes have equal sizes: what a small problem cannot show.
+
+Implementations take other paths for many rows, large tensors and long sequences: chunks, fused products, padding. The
+networks are as small as elsewhere, so that the reference takes a second; B, T and H are those of the paper.
+"""
+
+import dataclasses
+import functools
+from typing import Any
+
+import numpy as np
+
+from conformance.case import Cases, Equal, Setting, exactly, judged, related
+from conformance.cases.agent import SAMPLING_MARGIN, WHOLE, Example, bound_of, gradient_along
+from conformance.cases.losses import demands_of
+from conformance.check import check
+from conformance.compare import Comparisons
+from conformance.problems import Problem, make_problem, problem_in
+from conformance.settled import settled
+from reference_numpy import optimizer
+from spec import Discrete, Image, Spaces, Vector
+
+RUN = {"batch_size": 16, "batch_length": 64, "imagination_horizon": 15}
+EQUAL = {**dict.fromkeys(("batch_size", "batch_length", "imagination_horizon", "stoch", "classes", "blocks"), 4)}
+EQUAL_SPACES = Spaces(
+    {"image": Image(16, 16, 4), "mode": Discrete((4, 4)), "position": Vector(4)}, {"action": Discrete((4,))}
+)
+# A vector of parameters longer than the pieces in which optimizers update it, and tensors that cross their edges.
+TENSORS = {"a": (7,), "b": (3, 50_021), "c": (131_073,), "d": (2, 3, 4), "e": (300, 500)}
+
+
+@functools.lru_cache(maxsize=8)
+def batch_of_a_run(setting: Setting) -> Example:
+    """Everything that an agent can see and do, in a batch as large as the paper's. The return range stays as it is, so
+    that the gradient is the mean of those of the rows."""
+    problem = make_problem(setting.seed, setting.profile, "both", "mixed", setting.dtype, **RUN, return_decay=1.0)
+    return Example(settled(problem, SAMPLING_MARGIN), setting.seed)
+
+
+@functools.lru_cache(maxsize=8)
+def equal_sizes(setting: Setting) -> Example:
+    """Rows, time steps, horizon, latents, classes, blocks, channels and actions: four of each."""
+    problem = problem_in(EQUAL_SPACES, setting.seed, setting.profile, setting.dtype, **EQUAL)
+    return Example(settled(problem, SAMPLING_MARGIN), setting.seed)
+
+
+def row_of(problem: Problem, row: int) -> Problem:
+    """One row of the batch with its noise. The configuration is that of the whole."""
+    length = problem.config.batch_length
+    starts = slice(row * length, (row + 1) * length)
+    noise = {"posterior": problem.noise["posterior"][row : row + 1]}
+    noise |= {name: problem.noise[name][starts] for name in ("prior", "action")}
+    batch = {name: value[row : row + 1] for name, value in problem.batch.items()}
+    return dataclasses.replace(problem, batch=batch, noise=noise)
+
+
+BATCH = ("AGT-14", "AGT-26", "AGT-27", "RSSM-17", "RSSM-20", "RET-14", "LAY-2", "LAY-3", "NET-1", "CON-1", "CON-2")
+
+
+@check(*BATCH, "RET-12", uses=["losses"], level=2, dtypes=WHOLE)
+def losses_of_a_batch_match(setting: Setting) -> Cases:
+    """Every loss, metric and latent of 16 sequences of 64 steps, with 15 imagined steps from each: 15,360 returns for
+    the percentiles."""
+    problem = batch_of_a_run(setting).problem
+    moving = dataclasses.replace(problem, config=dataclasses.replace(problem.config, return_decay=0.9))
+    example = Example(moving, setting.seed)
+    yield judged("losses", moving.loss_arguments, *demands_of(example, "", bound_of(setting, 1e-9, 2e-4)).values())
+
+
+@check("AGT-28", "AGT-32", "CON-12", "CON-23", "LAY-2", "LAY-3", uses=["gradients"], level=2, dtypes=WHOLE)
+def gradient_of_a_batch_is_that_of_its_rows(setting: Setting) -> Cases:
+    """The gradient of a batch is the mean of the gradients of its rows, each asked for alone; and it is the one of the
+    losses along a direction."""
+    example = batch_of_a_run(setting)
+    problem, bound = example.problem, bound_of(setting, 1e-9, 1e-3)
+    rows = [row_of(problem, row) for row in range(problem.config.batch_size)]
+
+    def mean_of_rows(c: Comparisons, whole: Any, *parts: Any) -> None:
+        for name in problem.state["params"]:
+            each = np.array([np.asarray(part[name]) for part in parts])
+            size = np.abs(each).max() + 1e-30
+            c.compare(f"gradient of {name}", whole[name], each.mean(0), magnitude=size, bound=bound)
+        gradient_along(c, example, whole, ["all", "all, again"], bound_of(setting, 1e-5, 5e-3))
+
+    yield related(mean_of_rows, *(("gradients", one.loss_arguments) for one in (problem, *rows)))
+
+
+@check(*BATCH, uses=["losses"], level=2, dtypes=WHOLE)
+def losses_of_equal_sizes_match(setting: Setting) -> Cases:
+    """Every loss, metric and latent where as many axes as possible have the same size, so that an exchange of two gives
+    no error."""
+    example = equal_sizes(setting)
+    demands = demands_of(example, "", bound_of(setting, 1e-9, 2e-4))
+    yield judged("losses", example.problem.loss_arguments, *demands.values())
+
+
+@check("AGT-28", "AGT-32", "LAY-2", "LAY-3", uses=["gradients"], level=2, dtypes=WHOLE)
+def gradient_of_equal_sizes_matches(setting: Setting) -> Cases:
+    """The gradient of the total in all parameters and in every group, where axes have the same size."""
+    example = equal_sizes(setting)
+
+    def right(c: Comparisons, gradients: Any) -> None:
+        gradient_along(c, example, gradients, list(example.directions), bound_of(setting, 1e-6, 5e-3))
+
+    yield judged("gradients", example.problem.loss_arguments, right)
+
+
+@check("OPT-2", "OPT-8", "OPT-15", "OPT-16", uses=["optimizer_step"], level=3)
+def step_of_large_tensors_matches(setting: Setting) -> Cases:
+    """Parameters and moments of tensors with up to 150,063 numbers beside one with 7; every second tensor is
+    clipped."""
+    rng, config = setting.rng(), make_problem(setting.seed, setting.profile, "vector", "discrete", setting.dtype).config
+    config = dataclasses.replace(config, warmup_steps=0)
+
+    def drawn(spread: float) -> dict[str, np.ndarray]:
+        wide = dataclasses.replace(setting, dtype="float32") if setting.dtype == "bfloat16" else setting
+        return {name: wide.cast(rng.normal(0, spread, shape)) for name, shape in TENSORS.items()}
+
+    params, momentum, gradients = drawn(1.0), drawn(1.0), drawn(0.01)
+    second = {name: np.abs(value) + 0.01 for name, value in drawn(1.0).items()}
+    for name in list(TENSORS)[::2]:
+        gradients[name] = gradients[name] * 1024
+    state = {"step": 7, "second_moment": second, "momentum": momentum}
+    expected, moments = optimizer.optimizer_step(params, gradients, state, config)
+    bound, u = 1e-11 if setting.dtype == "float64" else 2e-5, setting.u
+    moves = {name: np.abs(new - params[name]).max() + 4 * u * np.abs(new) / bound for name, new in expected.items()}
+    yield judged(
+        "optimizer_step",
+        (params, gradients, state, config),
+        Equal(expected, at=(0,), where="params", magnitude=moves, bound=bound),
+        exactly(8, at=(1, "step"), where="step"),
+        Equal(moments["second_moment"], at=(1, "second_moment"), where="second_moment", bound=bound),
+        Equal(moments["momentum"], at=(1, "momentum"), where="momentum", magnitude=1.0, bound=bound),
+    )
