@@ -353,7 +353,18 @@ class Adapter(Protocol):
         """`train_step` with given samples in place of the noise: see `losses_given`."""
 
     # The object that is trained, with its own noise and caches.
-    def Learner(self, spaces: Spaces, config: Config, seed: int) -> "Learner": ...  # noqa: N802
+    def Learner(self, spaces: Spaces, config: Config, seed: int) -> "Learner":  # noqa: N802
+        """An agent and its optimizer in training: what runs for days.
+
+        Args:
+          spaces, config: of the task and of the agent.
+          seed: of the initial parameters.
+
+        Returns:
+          An object with the methods state_dict(), load_state_dict(state), train_step(batch, seed),
+          initial_carry(envs), policy(observation, is_first, carry, seed), train_noise(batch, seed) and
+          policy_noise(envs, seed). `conformance.adapter.Learner` says what they take and give.
+        """
 
     # replay and training loop: shared by all backends. The classes have the constructors and methods of the
     # reference's.

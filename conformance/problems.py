@@ -42,13 +42,13 @@ OPTIONS: dict[str, tuple[Any, ...]] = {
     **{f"{name}_scale": (0.3, 2.0) for name in ("reconstruction", "reward", "continue", "dynamics")},
     **{f"{name}_scale": (0.3, 2.0) for name in ("representation", "actor", "critic", "replay_critic")},
 }
-OBSERVED = (
+OBSERVED: tuple[dict[str, Vector | Discrete | Image], ...] = (
     {"image": Image(16, 32, 3)},
     {"mode": Discrete((3, 2)), "position": Vector(3)},
     {"depth": Image(32, 16, 1), "image": Image(32, 16, 3)},
     {"board": Discrete((2, 4)), "depth": Image(16, 16, 2), "place": Vector(1), "speed": Vector(2)},
 )
-ACTING = (
+ACTING: tuple[dict[str, Vector | Discrete], ...] = (
     {"action": Discrete((5,))},
     {"arm": Vector(2), "buttons": Discrete((2, 3)), "leg": Vector(1)},
     {"action": Vector(3)},

@@ -8,7 +8,7 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 
-from conformance.adapter import INTERFACE
+from conformance.adapter import INTERFACE, OBJECTS
 from conformance.case import Call, Case, Cases, Drawn, Equal, Setting, equal, exact, judged, refused, related
 from conformance.check import CHECKS, Check, check, script
 from conformance.compare import Comparisons, Deviation, entries
@@ -60,7 +60,7 @@ def test_a_check_builds_the_same_cases_again(one: Check) -> None:
 
 def test_scripts_are_few() -> None:
     """Only what hands a result on, drives an object or counts frequencies: everything else is data."""
-    driving = [one for one in SCRIPTS if set(one.uses) & {"Replay", "ReplayRatio"}]
+    driving = [one for one in SCRIPTS if set(one.uses) & set(OBJECTS)]
     drawing = [one for one in SCRIPTS if any(use.startswith("draw_") for use in one.uses)]
     others = {one.name for one in SCRIPTS} - {one.name for one in (*driving, *drawing)}
     assert len(others) <= 8, others

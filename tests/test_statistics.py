@@ -11,8 +11,9 @@ import pytest
 from conformance import statistics
 from conformance.adapters.numpy_adapter import NumpyAdapter
 from conformance.case import Setting
-from conformance.cases import sampling
+from conformance.cases import learner, sampling
 from conformance.execute import run_check, selected_checks
+from conformance.problems import train_noise
 from conformance.statistics import (
     distribution_distance,
     distribution_radius,
@@ -25,12 +26,28 @@ from conformance.statistics import (
 from reference_numpy.layers import TRUNCATED_NORMAL_STD
 from spec import Config, Spaces, parameter_table
 
-CHECKS = {check.name.partition(".")[2]: check for check in selected_checks("float64", "sampling.")}
+CHECKS = {
+    check.name.partition(".")[2]: check
+    for check in (*selected_checks("float64", "sampling."), *selected_checks("float64", "learner.noise"))
+}
 
 
 def status(name: str, adapter: object, seed: int = 0) -> tuple[str, str]:
     result = run_check(CHECKS[name], adapter, Setting("float64", "paper", seed))
     return result.status, result.message
+
+
+class Sampling(NumpyAdapter):
+    """The reference, and of a learner the noise."""
+
+    class Learner:
+        def __init__(self, task: Spaces, config: Config, seed: int) -> None:
+            self.task, self.config = task, config
+            self.state_dict = self.load_state_dict = self.train_step = self.initial_carry = self.policy = print
+            self.policy_noise = print
+
+        def train_noise(self, batch: Any, seed: int) -> dict[str, np.ndarray]:
+            return train_noise(np.random.default_rng(seed), self.config, self.task)
 
 
 def offering(**functions: Any) -> types.SimpleNamespace:
@@ -42,8 +59,8 @@ def test_every_statistical_check_is_counted() -> None:
 
 
 def test_the_level_is_shared_out() -> None:
-    """L of 10 tests in each of 4 checks: 40 tests with 2 exp(-L) each make one false alarm in a million runs."""
-    assert 40 * 2 * math.exp(-statistics.confidence(10)) == pytest.approx(1e-6)
+    """L of 10 tests in each of 5 checks: 50 tests with 2 exp(-L) each make one false alarm in a million runs."""
+    assert 50 * 2 * math.exp(-statistics.confidence(10)) == pytest.approx(1e-6)
 
 
 @pytest.mark.parametrize("name", CHECKS)
@@ -61,16 +78,17 @@ def test_the_number_of_tests_is_right(name: str, monkeypatch: pytest.MonkeyPatch
         made += np.size(actual)
         within(run, where, actual, expected, radius)
 
-    monkeypatch.setattr(sampling, "confidence", counted)
+    for module in (sampling, learner):
+        monkeypatch.setattr(module, "confidence", counted)
     monkeypatch.setattr(sampling, "within", counting)
-    assert status(name, NumpyAdapter())[0] == "pass"
+    assert status(name, Sampling())[0] == "pass"
     assert set(asked) == {made}
 
 
 def test_right_samplers_raise_fewer_alarms_than_stated(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With an allowed rate of 1/2 per run: 4 checks of 12 seeds alarm less often than in half of the runs, and at 1e-6
+    """With an allowed rate of 1/2 per run: 5 checks of 12 seeds alarm less often than in half of the runs, and at 1e-6
     never."""
-    adapter = NumpyAdapter()
+    adapter = Sampling()
     alarms = {0.5: 0, 1e-6: 0}
     for rate in alarms:
         monkeypatch.setattr(statistics, "FALSE_ALARMS", rate)

@@ -15,7 +15,7 @@ from conformance.cases.agent import (
     bound_of,
     loss_magnitude,
 )
-from conformance.cases.sampling import compare_distribution, compare_groups, require_shape, signs
+from conformance.cases.sampling import compare_distribution, compare_groups, require_shape, signs, tests_of
 from conformance.check import script
 from conformance.compare import part_of
 from conformance.problems import Problem, make_problem, nudged, random_observations, random_state, spaces
@@ -27,7 +27,7 @@ from spec import Discrete, Spaces, parameter_table
 SEEDS = 100  # tried until rounding moves no sample of a train step into another class
 ROWS = 3  # environments that act
 SHARED = 0.1  # of the numbers of one kind may occur elsewhere; of independent ones in float32 some 2 % do, by chance
-METHODS = ("state_dict", "load_state_dict", "train_step", "policy", "initial_carry")
+METHODS = ("state_dict", "load_state_dict", "train_step", "initial_carry", "policy", "train_noise", "policy_noise")
 
 
 def made(script: Script, problem: Problem, seed: int = 0) -> Any:
@@ -205,13 +205,13 @@ def noise_is_independent(script: Script) -> None:
         "action": (starts, config.imagination_horizon, task.action_noise_size),
     }
     found: dict[str, tuple[np.ndarray, bool]] = {}
-    for seed in (1, 2):
+    for seed in (1000 * setting.seed + 1, 1000 * setting.seed + 2):
         noise = {name: np.asarray(x, np.float64) for name, x in learner.train_noise(problem.batch, seed).items()}
         for name, shape in shapes.items():
             require_shape(script, f"noise of {name}", noise[name], shape)
         for label, numbers, uniform in numbers_of(noise, task):
             found[f"{label}, seed {seed}"] = numbers, uniform
-    level = confidence(len(found) * (1 + 4 * 3))
+    level = confidence(len(found) * (1 + 3 * tests_of([2, 2])))
     for label, (numbers, uniform) in found.items():
         cdf = (lambda x: np.clip(x, 0, 1)) if uniform else normal_cdf
         compare_distribution(script, label, numbers.ravel(), cdf, level)

@@ -1,0 +1,147 @@
+"""The checks of learners find what goes wrong in one: caches, state and noise."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pytest
+
+from conformance.adapters.torch_adapter import TorchAdapter
+from conformance.case import Setting
+from conformance.check import CHECKS
+from conformance.execute import run_check
+from impl_torch.learner import Learner
+from spec import Config, Spaces
+
+Noise = dict[str, Any]
+
+
+class StaleActing(Learner):
+    """Acts with the parameters of its first step."""
+
+    def train_step(self, batch: Any, seed: int) -> Any:
+        cached = self._acting
+        result = super().train_step(batch, seed)
+        self._acting = cached
+        return result
+
+
+class StaleAfterLoading(Learner):
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        cached = self._acting
+        super().load_state_dict(state)
+        self._acting = cached
+
+
+class Forgetful(Learner):
+    """Takes over everything but the momentum."""
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        super().load_state_dict(state)
+        self._momentum.zero_()
+
+
+class Shared(Learner):
+    """Gives out its own memory."""
+
+    def state_dict(self) -> dict[str, Any]:
+        return {**super().state_dict(), **{name: x.numpy() for name, x in self._tensors().items()}}
+
+
+class SlowCriticFirst(Learner):
+    def _update(self, return_range: Any) -> Any:
+        self._slow_flat.lerp_(self._critic_flat, 1 - self.config.slow_critic_decay)
+        before = self._slow_flat.clone()
+        result = super()._update(return_range)
+        self._slow_flat.copy_(before)
+        return result
+
+
+class RangeForgotten(Learner):
+    def _update(self, return_range: Any) -> Any:
+        before = self._low, self._high
+        result = super()._update(return_range)
+        self._low, self._high = before
+        return result
+
+
+class MomentsFromOne(Learner):
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self._second_moment.fill_(1.0)
+
+
+def changed(change: Any) -> type[Learner]:
+    class Changed(Learner):
+        def _train_noise(self, shape: Any, seed: int) -> Noise:
+            return dict(change(super()._train_noise(shape, seed), seed, self))
+
+    return Changed
+
+
+def as_before(noise: Noise, seed: int, learner: Any) -> Noise:
+    return Learner._train_noise(learner, noise["posterior"].shape[:2], 0)
+
+
+def posterior_for_the_prior(noise: Noise, seed: int, learner: Any) -> Noise:
+    start = noise["posterior"].reshape(-1, 1, noise["posterior"].shape[-1])
+    noise["prior"][:, :1] = start
+    return noise
+
+
+def one_row(noise: Noise, seed: int, learner: Any) -> Noise:
+    return noise | {"posterior": noise["posterior"][:1].expand_as(noise["posterior"]).clone()}
+
+
+def one_horizon(noise: Noise, seed: int, learner: Any) -> Noise:
+    return noise | {"action": noise["action"][:, :1].expand_as(noise["action"]).clone()}
+
+
+def opposite_rows(noise: Noise, seed: int, learner: Any) -> Noise:
+    noise["prior"][1::2] = 1 - noise["prior"][::2] - 2.0**-24
+    return noise
+
+
+def one_latent(noise: Noise, seed: int, learner: Any) -> Noise:
+    return noise | {"prior": noise["prior"][..., :1].expand_as(noise["prior"]).clone()}
+
+
+MISTAKES = {
+    "train_steps_match": (SlowCriticFirst, RangeForgotten, MomentsFromOne),
+    "acting_uses_the_newest_parameters": (StaleActing, StaleAfterLoading),
+    "a_state_is_everything": (Forgetful, Shared),
+    "noise_is_independent": tuple(
+        map(changed, (as_before, posterior_for_the_prior, one_row, one_horizon, opposite_rows, one_latent))
+    ),
+}
+
+
+class Candidate(TorchAdapter):
+    def __init__(self, kind: type[Learner]) -> None:
+        super().__init__("float32", None)
+        self._kind = kind
+
+    def Learner(self, spaces: Spaces, config: Config, seed: int) -> Learner:  # noqa: N802
+        return self._kind(spaces, self._enter(config), seed=seed)
+
+
+@pytest.mark.parametrize(
+    ("check", "kind"),
+    [
+        pytest.param(check, kind, id=f"{check}-{kind.__name__}-{number}")
+        for check, kinds in MISTAKES.items()
+        for number, kind in enumerate((Learner, *kinds))
+    ],
+)
+def test_mistakes_of_learners_are_found(check: str, kind: type[Learner]) -> None:
+    result = run_check(CHECKS[f"learner.{check}"], Candidate(kind), Setting("float32", "paper"))
+    assert result.status == ("pass" if kind is Learner else "fail"), result.message
+
+
+def test_a_learner_without_a_method_is_told_so() -> None:
+    class Partly(Candidate):
+        def Learner(self, spaces: Spaces, config: Config, seed: int) -> Any:  # noqa: N802
+            return np.zeros(0)
+
+    result = run_check(CHECKS["learner.a_state_is_everything"], Partly(Learner), Setting("float32", "paper"))
+    assert (result.status, "state_dict" in result.message) == ("fail", True)
