@@ -54,7 +54,7 @@ def result_data(
     implementation: Mapping[str, Any],
     results: Iterable[Result],
     expected: ExpectedFailures,
-    diagnoses: Sequence[Mapping[str, Any]] = (),
+    diagnoses: Sequence[Mapping[str, Any]] | None = (),
     choice: str = "given",
     fit: Data | None = None,
 ) -> Data:
@@ -62,7 +62,8 @@ def result_data(
 
     Args:
       implementation: of `identity`.
-      diagnoses: of the mutants that the candidate behaves like, each as the schema's `diagnosis` says.
+      diagnoses: of the mutants that the candidate behaves like, each as the schema's `diagnosis` says; None where they
+        were not looked for.
       choice: how the edition was chosen: "given", "claimed" or "best fit".
       fit: how well each edition fits, as the schema's `fit` says; None where that was not asked.
 
@@ -86,7 +87,7 @@ def result_data(
         ],
         "checks": {result.check.name: _check(result, options, expected) for result in results},
         "requirements": {one.requirement: _requirement(one) for one in by_requirement(results)},
-        "diagnoses": [dict(diagnosis) for diagnosis in diagnoses],
+        "diagnoses": None if diagnoses is None else [dict(diagnosis) for diagnosis in diagnoses],
     }
 
 

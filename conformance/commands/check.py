@@ -59,6 +59,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--expect", type=Path, metavar="FILE", help="failures that are known, each with a reason: see docs/reports.md"
     )
+    parser.add_argument(
+        "--no-diagnosis", action="store_true", help="do not look for the known mistakes that failures come from"
+    )
     parser.add_argument("--at-least", type=int, default=1, metavar="N", help="fail unless so many checks pass")
     files = parser.add_argument_group("reports, written to files")
     files.add_argument("--json", type=Path, metavar="FILE", help="the whole result, see conformance/report.schema.json")
@@ -96,7 +99,7 @@ def main(console: Console, options: argparse.Namespace) -> int:
             result.check for result in results if result.status in FAILING and not result.extreme
         ):
             fits = _fit(console, checks, adapter, options)
-        diagnoses = _diagnoses(console, adapter, results, asked)
+        diagnoses = None if options.no_diagnosis else _diagnoses(console, adapter, results, asked)
         choice = "given" if given else "claimed" if named else "best fit"
         data = result_data(
             asked,

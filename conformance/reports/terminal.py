@@ -27,9 +27,9 @@ def show(console: Console, data: Data) -> None:
     """Prints it. Control characters of an implementation's messages do nothing."""
     data = _printable(data)
     _chapters(console, data)
-    for line in (*summary.edition(data), *summary.unchecked(data)):
+    for line in summary.notes(data):
         _plain(console, line)
-    for diagnosis in data["diagnoses"]:
+    for diagnosis in summary.diagnoses(data):
         _diagnosis(console, diagnosis)
     failures = summary.failures(data)
     _failures(console, failures.ordinary, SHOWN)
