@@ -24,6 +24,7 @@ from conformance.schema import misfit, validator
 FORMAT = 1
 
 Data = dict[str, Any]
+NONE_EXPECTED = ExpectedFailures()
 
 
 def finite(number: float) -> float | None:
@@ -85,7 +86,7 @@ def result_data(
             {"name": name, "reason": reason, "outcome": expected.outcome(name, results)}
             for name, reason in expected.reasons.items()
         ],
-        "checks": {result.check.name: _check(result, options, expected) for result in results},
+        "checks": {result.check.name: check_data(result, options, expected) for result in results},
         "requirements": {one.requirement: _requirement(one) for one in by_requirement(results)},
         "diagnoses": None if diagnoses is None else [dict(diagnosis) for diagnosis in diagnoses],
     }
@@ -112,7 +113,8 @@ def _checks(count: int) -> str:
     return f"{count} {'check' if count == 1 else 'checks'}"
 
 
-def _check(result: Result, options: CheckOptions, expected: ExpectedFailures) -> Data:
+def check_data(result: Result, options: CheckOptions, expected: ExpectedFailures = NONE_EXPECTED) -> Data:
+    """What one check found, as the schema's `check` says."""
     check = result.check
     return {
         "status": result.status,
