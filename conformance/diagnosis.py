@@ -10,7 +10,7 @@ deviation.
 import copy
 import dataclasses
 import functools
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -42,6 +42,9 @@ VALUES = tuple(
 )
 """The checks that all losses are right."""
 
+Watch = Callable[[str, Collection[Check]], Iterable[Check]]
+"""Hands out checks one after the other, and may tell somebody what is done with them and how far it is."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Diagnosis:
@@ -72,24 +75,29 @@ class Diagnosis:
         }
 
 
-def diagnose(adapter: object, results: Iterable[Result], setting: Setting) -> list[Diagnosis]:
+def unwatched(what: str, checks: Collection[Check]) -> Iterable[Check]:
+    return checks
+
+
+def diagnose(adapter: object, results: Iterable[Result], setting: Setting, watch: Watch = unwatched) -> list[Diagnosis]:
     """The mistakes that explain why checks fail, those that explain most first; each explains a check that none before
     it does.
 
     Args:
       adapter: the candidate.
       results: of all checks that were run on it, with the settings that follow.
+      watch: hands out the failing checks.
     """
     results = list(results)
     candidate = _Candidate(adapter, setting, {result.check.name: result.status for result in results})
     failing = [result.check for result in results if result.status in ("fail", "error")]
     failing.sort(key=lambda check: (check.level, _of_derivatives(check), candidate.size(check), check.name))
-    traces = {check: trace for check in failing if (trace := candidate.trace(check))}
+    traces = {check: trace for check in watch("diagnosis, recording", failing) if (trace := candidate.trace(check))}
     # What is compared soonest and says most comes first: derivatives are slow, extreme input is special.
     evidence = dict(sorted(traces.items(), key=lambda item: (_of_derivatives(item[0]), not item[1].ordinary)))
     explained = {
         mutant: {check for check, trace in evidence.items() if candidate.explains(mutant, check, trace)}
-        for mutant in _suspects(candidate, evidence)
+        for mutant in _suspects(candidate, evidence, watch)
     }
     passing = [result.check for result in results if result.status == "pass"]
     diagnoses: list[Diagnosis] = []
@@ -104,11 +112,12 @@ def diagnose(adapter: object, results: Iterable[Result], setting: Setting) -> li
     return diagnoses
 
 
-def _suspects(candidate: "_Candidate", evidence: dict[Check, "_Trace"]) -> list[Mutant]:
+def _suspects(candidate: "_Candidate", evidence: dict[Check, "_Trace"], watch: Watch) -> list[Mutant]:
     """The mutants that explain a failing check. A check that one of them explains is not searched for others."""
     found: list[Mutant] = []
     tries = 0
-    for check, trace in evidence.items():
+    for check in watch("diagnosis, comparing", evidence):
+        trace = evidence[check]
         if any(candidate.explains(mutant, check, trace) for mutant in found):
             continue
         if new := [mutant for mutant in MUTANTS.values() if candidate.explains(mutant, check, trace)]:

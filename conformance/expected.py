@@ -48,19 +48,25 @@ def read_expected(path: Path) -> ExpectedFailures:
         entries = tomllib.loads(read_text(path))
     except ValueError as error:
         raise UserError(f"{path}: {error}") from error
+    reasons = _flat(entries)
+    require_reasons(reasons, str(path))
+    return ExpectedFailures(reasons)
+
+
+def require_reasons(reasons: Mapping[str, Any], where: str) -> None:
+    """Raises UserError unless these are names of checks or requirements, each with a reason. where: what the message
+    begins with."""
     import conformance.cases  # noqa: F401 - importing registers the checks
 
-    reasons = _flat(entries)
     known = {*CHECKS, *requirements()}
     for name, reason in reasons.items():
         if name not in known:
             close = difflib.get_close_matches(name, known, n=1)
             raise UserError(
-                f"{path}: no check and no requirement is named {name}" + (f"; is {close[0]} meant?" if close else "")
+                f"{where}: no check and no requirement is named {name}" + (f"; is {close[0]} meant?" if close else "")
             )
         if not isinstance(reason, str) or not reason.strip():
-            raise UserError(f"{path}: {name}: expected a reason as text, got {reason!r:.80}")
-    return ExpectedFailures(reasons)
+            raise UserError(f"{where}: {name}: expected a reason as text, got {reason!r:.80}")
 
 
 def _flat(entries: Mapping[str, Any]) -> dict[str, Any]:

@@ -24,6 +24,7 @@ from conformance.schema import misfit, validator
 FORMAT = 1
 
 Data = dict[str, Any]
+NONE_EXPECTED = ExpectedFailures()
 
 
 def finite(number: float) -> float | None:
@@ -54,7 +55,7 @@ def result_data(
     implementation: Mapping[str, Any],
     results: Iterable[Result],
     expected: ExpectedFailures,
-    diagnoses: Sequence[Mapping[str, Any]] = (),
+    diagnoses: Sequence[Mapping[str, Any]] | None = (),
     choice: str = "given",
     fit: Data | None = None,
 ) -> Data:
@@ -62,7 +63,8 @@ def result_data(
 
     Args:
       implementation: of `identity`.
-      diagnoses: of the mutants that the candidate behaves like, each as the schema's `diagnosis` says.
+      diagnoses: of the mutants that the candidate behaves like, each as the schema's `diagnosis` says; None where they
+        were not looked for.
       choice: how the edition was chosen: "given", "claimed" or "best fit".
       fit: how well each edition fits, as the schema's `fit` says; None where that was not asked.
 
@@ -84,9 +86,9 @@ def result_data(
             {"name": name, "reason": reason, "outcome": expected.outcome(name, results)}
             for name, reason in expected.reasons.items()
         ],
-        "checks": {result.check.name: _check(result, options, expected) for result in results},
+        "checks": {result.check.name: check_data(result, options, expected) for result in results},
         "requirements": {one.requirement: _requirement(one) for one in by_requirement(results)},
-        "diagnoses": [dict(diagnosis) for diagnosis in diagnoses],
+        "diagnoses": None if diagnoses is None else [dict(diagnosis) for diagnosis in diagnoses],
     }
 
 
@@ -111,7 +113,8 @@ def _checks(count: int) -> str:
     return f"{count} {'check' if count == 1 else 'checks'}"
 
 
-def _check(result: Result, options: CheckOptions, expected: ExpectedFailures) -> Data:
+def check_data(result: Result, options: CheckOptions, expected: ExpectedFailures = NONE_EXPECTED) -> Data:
+    """What one check found, as the schema's `check` says."""
     check = result.check
     return {
         "status": result.status,

@@ -69,7 +69,7 @@ def mean_kl_losses(
 
 
 def test_the_examples_of_the_document_pass(monkeypatch: pytest.MonkeyPatch) -> None:
-    example, means, given, draw = blocks("python")
+    example, means, given, draw, _ = blocks("python")  # the last: tests/test_own_tests.py
     mine = types.ModuleType("example")
     exec(example, vars(mine))
     adapter = ModuleAdapter(mine, "float64")

@@ -11,7 +11,7 @@ from xml.etree import ElementTree
 
 import pytest
 from html_document import Document
-from report_data import ABSENT, CHECKS, ERROR, FAIL, HOSTILE, PASS, adapter, make
+from report_data import ABSENT, ADAPTER, CHECKS, ERROR, FAIL, HOSTILE, PASS, adapter, make
 from rich.console import Console
 
 from conformance.case import Setting
@@ -21,6 +21,7 @@ from conformance.offered import offered, unchecked
 from conformance.pages import prose, tex
 from conformance.reports import badge, html, junit, markdown, summary, terminal
 from conformance.requirements import check_label, requirements
+from conformance.results import read
 
 
 @pytest.fixture(scope="module")
@@ -86,6 +87,34 @@ def test_the_terminal(data: dict[str, Any]) -> None:
     assert "  lambda_return, called with\n    reward = [[9.0, 1.0, 0.0, 2.0]]\n" in text
     assert "--html" not in text
     assert len(text.splitlines()) < 65
+
+
+def test_without_a_diagnosis_the_reports_say_so(
+    data: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "mine.py").write_text(ADAPTER, encoding="utf-8")
+    check = [
+        "check",
+        str(tmp_path / "mine.py"),
+        "--edition",
+        "paper",
+        "--only",
+        FAIL,
+        "--json",
+        str(tmp_path / "r.json"),
+    ]
+    assert main([*check, "--no-diagnosis"]) == 1
+    printed = capsys.readouterr().out
+    made = read(tmp_path / "r.json")
+    assert made["diagnoses"] is None
+    told = "No diagnosis was made (--no-diagnosis)."
+    for text in (printed, html.render([made]), html.render([data, made])):
+        assert told in text
+    assert told.replace("_", "\\_") in markdown.render(made)
+    assert junit.render(made).count("<failure") == 2
+    for text in (printed, markdown.render(made), junit.render(made)):
+        assert "behaves like" not in text.lower()
+    assert told not in shown(data)
 
 
 def test_markdown(data: dict[str, Any]) -> None:

@@ -15,6 +15,7 @@ from conformance.editions import Fit, best, by_comparison, fit, judge_twice, tel
 from conformance.errors import UserError
 from conformance.execute import FAILING, CheckOptions, Result, calls_of, selected_checks
 from conformance.expected import ExpectedFailures, read_expected
+from conformance.progress import Progress
 from conformance.reports import badge, html, junit, markdown, terminal
 from conformance.results import Data, identity, result_data, write, write_text
 from spec import editions, find_edition
@@ -59,6 +60,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--expect", type=Path, metavar="FILE", help="failures that are known, each with a reason: see docs/reports.md"
     )
+    parser.add_argument(
+        "--no-diagnosis", action="store_true", help="do not look for the known mistakes that failures come from"
+    )
     parser.add_argument("--at-least", type=int, default=1, metavar="N", help="fail unless so many checks pass")
     files = parser.add_argument_group("reports, written to files")
     files.add_argument("--json", type=Path, metavar="FILE", help="the whole result, see conformance/report.schema.json")
@@ -78,25 +82,28 @@ def main(console: Console, options: argparse.Namespace) -> int:
     if not checks:
         raise UserError(f"no check matches --only {options.only!r}")
     expected = read_expected(options.expect) if options.expect else ExpectedFailures()
-    with candidate(options.candidate, options.process, options.dtype, options.device, options.timeout) as adapter:
+    with (
+        candidate(options.candidate, options.process, options.dtype, options.device, options.timeout) as adapter,
+        Progress() as progress,
+    ):
         for remark in remarks(adapter):
             console.print(remark, markup=False, highlight=False)
         implementation = identity(adapter, options.candidate or options.process or "")
         given = options.edition or (OUR_EDITION if options.candidate in OUR_CANDIDATES else None)
         named = given or _claimed(implementation["edition"])
-        fits = [] if named else _fit(console, checks, adapter, options)
+        fits = [] if named else _fit(progress, checks, adapter, options)
         asked = CheckOptions(
             candidate=options.candidate or options.process or "",
             process=options.process is not None,
             edition=named or best(fits).edition,
             **{name: getattr(options, name) for name in ("dtype", "device", "only", "seed", "examples", "at_least")},
         )
-        results = list(_run_all(console, checks, adapter, asked))
+        results = list(_run_all(progress, checks, adapter, asked))
         if named and telling_checks(
             result.check for result in results if result.status in FAILING and not result.extreme
         ):
-            fits = _fit(console, checks, adapter, options)
-        diagnoses = _diagnoses(console, adapter, results, asked)
+            fits = _fit(progress, checks, adapter, options)
+        diagnoses = None if options.no_diagnosis else _diagnoses(progress, adapter, results, asked)
         choice = "given" if given else "claimed" if named else "best fit"
         data = result_data(
             asked,
@@ -124,28 +131,25 @@ def _claimed(name: str | None) -> str | None:
         raise UserError(f"the adapter's edition(): {error}") from error
 
 
-def _fit(console: Console, checks: list[Check], adapter: object, options: argparse.Namespace) -> list[Fit]:
-    with console.status("finding the edition that fits best"):
-        return fit(telling_checks(checks), adapter, options.dtype, options.seed)
+def _fit(progress: Progress, checks: list[Check], adapter: object, options: argparse.Namespace) -> list[Fit]:
+    return fit(progress.over("editions", telling_checks(checks)), adapter, options.dtype, options.seed)
 
 
-def _run_all(console: Console, checks: list[Check], adapter: object, asked: CheckOptions) -> Iterable[Result]:
+def _run_all(progress: Progress, checks: list[Check], adapter: object, asked: CheckOptions) -> Iterable[Result]:
     edition = editions()[asked.edition]
     if compile_calls := getattr(adapter, "compile_calls", None):
-        with console.status("compiling"):
-            compile_calls(calls_of(checks, adapter, asked.setting))
-    with console.status("checking") as status:
-        for number, check in enumerate(checks, 1):
-            status.update(f"{number}/{len(checks)} {check.name}")
-            yield judge_twice(check, adapter, edition, asked.dtype, asked.seed, asked.examples)
+        progress.say("compiling")
+        compile_calls(calls_of(checks, adapter, asked.setting))
+    for check in progress.over("checks", checks):
+        yield judge_twice(check, adapter, edition, asked.dtype, asked.seed, asked.examples)
 
 
-def _diagnoses(console: Console, adapter: object, results: list[Result], asked: CheckOptions) -> list[Data]:
+def _diagnoses(progress: Progress, adapter: object, results: list[Result], asked: CheckOptions) -> list[Data]:
     """The mistakes that explain failures. What the edition has otherwise is none."""
+    progress.say("diagnosis")
     edition = editions()[asked.edition]
     results = [
         result for result in results if result.status not in FAILING or not by_comparison(result, edition, asked)
     ]
-    with console.status("comparing failures with known mistakes"):
-        found = diagnose(adapter, results, asked.setting)
+    found = diagnose(adapter, results, asked.setting, progress.over)
     return [diagnosis.to_json() for diagnosis in found if diagnosis.mutant.name not in edition.mutants]

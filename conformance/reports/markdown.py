@@ -12,7 +12,7 @@ def render(data: Data) -> str:
         f"# Conformance of {text(summary.label(data))}",
         f"**{text(summary.headline(data)).capitalize()}.**",
         f"{text(summary.settings(data))}, {text(data['date'])}. {text(summary.tally(data))}.",
-        text(" ".join([*summary.edition(data), *summary.unchecked(data)])),
+        text(" ".join(summary.notes(data))),
         _chapters(data),
         *_diagnoses(data),
         *_requirements(data),
@@ -70,7 +70,7 @@ def _diagnoses(data: Data) -> list[str]:
         f"{chapter(found['chapter'])}. {text(found['fix'])} "
         f"Explains {', '.join(map(code, found['explained']))}."
         + (f" Known from: {text(found['provenance'])}." if found["provenance"] else "")
-        for found in data["diagnoses"]
+        for found in summary.diagnoses(data)
     ]
     return ["## It behaves like", "\n".join(lines)] if lines else []
 

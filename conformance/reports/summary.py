@@ -224,6 +224,12 @@ def unchecked(data: Data) -> list[str]:
     return [f"{words}: {', '.join(entries)}." for words, entries in parts.items() if entries]
 
 
+def notes(data: Data) -> list[str]:
+    """What is to be known of a run beside its outcome: sentences."""
+    undiagnosed = ["No diagnosis was made (--no-diagnosis)."] if data["diagnoses"] is None else []
+    return [*edition(data), *unchecked(data), *undiagnosed]
+
+
 def tally(data: Data) -> str:
     """Checks by status, in words."""
     found = counts(data)
@@ -259,9 +265,14 @@ def checks_of(data: Data, requirement: str, statuses: Collection[str] = STATUSES
     return [check_label(name, check["requirements"]) for name, check in found.items() if told(check) in statuses]
 
 
+def diagnoses(data: Data) -> list[Data]:
+    """The mistakes recognized."""
+    return list(data["diagnoses"] or ())
+
+
 def matching(data: Data, check: str) -> list[Data]:
     """The diagnoses that explain a check."""
-    return [diagnosis for diagnosis in data["diagnoses"] if check in diagnosis["explained"]]
+    return [diagnosis for diagnosis in diagnoses(data) if check in diagnosis["explained"]]
 
 
 @functools.cache

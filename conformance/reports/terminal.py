@@ -25,11 +25,11 @@ LINES = 10  # of one message: the last of a traceback say what happened
 
 def show(console: Console, data: Data) -> None:
     """Prints it. Control characters of an implementation's messages do nothing."""
-    data = _printable(data)
+    data = printable(data)
     _chapters(console, data)
-    for line in (*summary.edition(data), *summary.unchecked(data)):
+    for line in summary.notes(data):
         _plain(console, line)
-    for diagnosis in data["diagnoses"]:
+    for diagnosis in summary.diagnoses(data):
         _diagnosis(console, diagnosis)
     failures = summary.failures(data)
     _failures(console, failures.ordinary, SHOWN)
@@ -95,27 +95,29 @@ def _failures(console: Console, failing: Sequence[tuple[str, Data]], shown: int)
         console.print(
             f"\n[bold red]{name}[/] ({', '.join(check['requirements'])}): {escape(check['summary'])}", highlight=False
         )
-        lines = check["message"].rstrip().splitlines()
-        _plain(console, "\n".join(["..."] * (len(lines) > LINES) + lines[-LINES:]))
-        failure = check["failure"]
-        if failure["function"]:
-            _plain(
-                console,
-                "\n".join(
-                    [f"  {failure['function']}, called with", *(f"    {line}" for line in brief(failure["arguments"]))]
-                ),
-            )
-        console.print(f"  {failure['command']}", markup=False, highlight=False, soft_wrap=True)
+        _plain(console, details(check))
+        console.print(f"  {check['failure']['command']}", markup=False, highlight=False, soft_wrap=True)
     if len(failing) > shown:
         number = f"and {len(failing) - shown} more" if shown else f"{len(failing)}"
         _plain(console, f"\n{number}: {', '.join(name for name, _ in failing[shown:])}")
 
 
-def _printable(value: Any) -> Any:
+def details(check: Data) -> str:
+    """What went wrong, and the call in which it did."""
+    lines = check["message"].rstrip().splitlines()
+    told = ["..."] * (len(lines) > LINES) + lines[-LINES:]
+    failure = check["failure"]
+    if failure["function"]:
+        told += [f"  {failure['function']}, called with", *(f"    {line}" for line in brief(failure["arguments"]))]
+    return "\n".join(told)
+
+
+def printable(value: Any) -> Any:
+    """The same in plain JSON types, with nothing that a terminal would obey."""
     if isinstance(value, dict):
-        return {_printable(key): _printable(entry) for key, entry in value.items()}
+        return {printable(key): printable(entry) for key, entry in value.items()}
     if isinstance(value, list):
-        return list(map(_printable, value))
+        return list(map(printable, value))
     return (
         re.sub(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]", "\N{REPLACEMENT CHARACTER}", value)
         if isinstance(value, str)
