@@ -49,7 +49,7 @@ def closed() -> Any:
 @pytest.fixture
 def single(make: Make) -> Make:
     return functools.partial(
-        make, task="test_train_single:Watched", envs=1, image_size=16, replay_ratio=RATIO, steps=150
+        make, task="test_train_single:Watched", envs=1, image_size=16, replay_ratio=RATIO, steps=150, processes="no"
     )
 
 

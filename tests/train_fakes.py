@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
+from fake_state import digest, fresh_state, next_state
 from gymnasium import spaces as gym
 
 from dreamer_spec.envs import random_actions
@@ -153,8 +154,8 @@ def wrong_shape() -> gymnasium.Env[Any, Any]:
 
 
 class FakeLearner:
-    """Obeys dreamer_spec/backend.py in NumPy: random actions, latents that say which call made them, and a diary of
-    what it was given."""
+    """Obeys dreamer_spec/backend.py in NumPy: random actions, latents that say which call made them, a training state
+    of which nothing may be lost (`fake_state.py`), and a diary of what it was given."""
 
     diary: ClassVar[list[tuple[str, Any]]] = []
     seeds: ClassVar[list[tuple[str, int]]] = []
@@ -174,7 +175,7 @@ class FakeLearner:
             raise ValueError(f"no device {device!r}; available: cpu")
         self.device = "cpu"
         self._spaces, self._config = spaces, config
-        self._train_steps = 0
+        self._state = fresh_state()
         self.seeds.append(("parameters", seed))
 
     def initial_carry(self, envs: int) -> Any:
@@ -192,18 +193,19 @@ class FakeLearner:
     def policy(
         self, observation: Mapping[str, np.ndarray], is_first: np.ndarray, carry: Any, seed: int, mode: bool = False
     ) -> tuple[np.ndarray, dict[str, np.ndarray], Any]:
-        """deter[0] counts the policy steps since the last reset of the row, deter[1] is the seed."""
+        """deter[0] counts the policy steps since the last reset of the row, deter[1] is the seed, deter[2] tells one
+        training state from another."""
         assert set(observation) == set(self._spaces.observations)
         action = 3 * random_actions(self._spaces, np.random.default_rng(seed), len(is_first))
         carry = np.where(is_first, 0, carry + 1)
         deter = np.zeros((len(is_first), self._config.deter), np.float32)
-        deter[:, 0], deter[:, 1] = carry, seed
+        deter[:, 0], deter[:, 1], deter[:, 2] = carry, seed, digest(self._state)
         self.seeds.append(("policy", seed))
         self.diary.append(("policy", {key: value.copy() for key, value in observation.items()}))
         return action, {"deter": deter, "stoch": np.zeros((len(is_first), self._config.stoch), np.int32)}, carry
 
     def train_step(self, batch: Mapping[str, np.ndarray], seed: int) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-        """The latents that are to be written back are 1000 + the number of the train step."""
+        """The latents that are to be written back are 1000 + the number of the update."""
         assert set(batch) == {
             *self._spaces.observations,
             "reward",
@@ -214,11 +216,12 @@ class FakeLearner:
             "deter",
             "stoch",
         }
-        self._train_steps += 1
+        if np.isfinite(self.loss):
+            self._state = next_state(self._state, batch, seed)
         self.seeds.append(("train", seed))
         self.diary.append(("train", {key: value.copy() for key, value in batch.items()}))
         shape = (self._config.batch_size, self._config.batch_length)
-        deter = np.full((*shape, self._config.deter), 1000 + self._train_steps, np.float32)
+        deter = np.full((*shape, self._config.deter), 1000 + self._state["optimizer/step"], np.float32)
         return {"loss/total": np.float32(self.loss), "skipped": np.float32(not np.isfinite(self.loss))}, {
             "deter": deter,
             "stoch": np.ones((*shape, self._config.stoch), np.int32),
@@ -250,16 +253,12 @@ class FakeLearner:
         return {"loss/total": self.loss}, {"w": np.full((3, 2), self.loss, np.float32)}
 
     def state_dict(self) -> dict[str, np.ndarray]:
-        return {
-            "params/w": np.arange(6.0, dtype=np.float32).reshape(2, 3).T,  # not contiguous
-            "optimizer/step": np.array(self._train_steps),
-        }
+        return {name: array.copy(order="K") for name, array in self._state.items()}
 
     def load_state_dict(self, state: Mapping[str, np.ndarray]) -> None:
-        if set(state) != set(self.state_dict()):
+        if set(state) != set(self._state):
             raise ValueError(f"unexpected names {sorted(state)}")
-        assert state["params/w"].tolist() == self.state_dict()["params/w"].tolist()
-        self._train_steps = int(state["optimizer/step"])
+        self._state = {name: np.array(array) for name, array in state.items()}
 
 
 class Fragile(Counting):

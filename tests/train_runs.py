@@ -30,10 +30,10 @@ BATCH_STEPS = SMALL["batch_size"] * SMALL["batch_length"]
 Make = Callable[..., Options]
 
 
-def run_quietly(options: Options) -> Any:
+def run_quietly(options: Options, learner: type[FakeLearner] = FakeLearner) -> Any:
     """The state of a run after its loop."""
     with ExitStack() as stack:
-        state = setup.prepare(options, FakeLearner, stack)
+        state = setup.prepare(options, learner, stack)
         loop.train(state)
         return state
 
