@@ -16,7 +16,7 @@ from typing import Any
 CATALOGUES = ("torch", "jax", "learners", "trainer")
 KINDS = {
     "wrong_axis": "a fused operation along a wrong axis, or along too many",
-    "precision": "right in the widest precision only: a cast too early, a sum or a product in a narrow one",
+    "precision": "right in one precision and wrong in another: a cast too early, a sum or a product in a narrow one",
     "forgotten_reset": "what was taken out of a loop, or back through it, forgets is_first",
     "configured_size": "a mean, a reshape or noise by the configured batch in place of the actual one",
     "chunk_boundary": "only what is larger than a threshold: a piece dropped, in another order, or in place of all",

@@ -45,9 +45,13 @@ def _write(file: Path, patch: Patch) -> None:
 
 
 def environment(root: Path, compiled: Path) -> dict[str, str]:
-    """Of a process in the copy. compiled: where JAX keeps programs for the next mutant: most are those of the last."""
+    """Of a process in the copy: what is computed is small, and several threads would cost more than they win.
+
+    compiled: where JAX keeps programs for the next mutant: most are those of the last.
+    """
     return {
         **os.environ,
+        **dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"),
         "PYTHONPATH": str(root),
         "JAX_COMPILATION_CACHE_DIR": str(compiled),
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
