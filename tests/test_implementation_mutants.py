@@ -56,7 +56,7 @@ def test_the_catalogue_is_complete() -> None:
 
 def test_a_mistake_that_does_not_fit_is_an_error() -> None:
     patch = Patch("wrong", "loop", "impl_torch/scan.py", "nothing of this kind", "", "None.")
-    with pytest.raises(ValueError, match="mutant wrong: impl_torch/scan.py holds 0 times 'nothing of this kind'"):
+    with pytest.raises(ValueError, match=r"mutant wrong: impl_torch/scan\.py holds 0 times 'nothing of this kind'"):
         patch.apply("source")
 
 
