@@ -44,7 +44,8 @@ def main(console: Console, names: Sequence[str], json: Path | None) -> int:
         for number, (patch, outcome) in enumerate(trials(asked), 1):
             report[patch.name] = entry = to_json(patch, outcome)
             words = f"[bold red]{entry['words']}[/]" if is_bad(entry) else entry["words"]
-            console.print(f"{patch.kind:16} {patch.name:48} {words} ({outcome.seconds:.0f} s)", highlight=False)
+            line = f"{patch.kind:16} {patch.name:48} {words} ({outcome.seconds:.0f} s)"
+            console.print(line, highlight=False, soft_wrap=True)
             status.update(f"{number}/{len(asked)}")
             if json:  # after each: a night may be too short
                 write(json, {"versions": versions(), "mutants": report})

@@ -78,7 +78,8 @@ class Trials:
             return found
         for arguments in patch.tests:
             tested = tested_with(arguments, root, compiled)
-            if tested.is_caught and self._sound(patch, dataclasses.replace(tested, name=arguments), compiled):
+            alone = " ".join([str(tested.name), *arguments.split()[1:]])  # the test that failed, of the same backend
+            if tested.is_caught and self._sound(patch, dataclasses.replace(tested, name=alone), compiled):
                 return tested
         return found
 
