@@ -13,6 +13,7 @@ A part stands between a marker line and an end line, and is never edited by hand
 """
 
 import ast
+import collections
 import functools
 import json
 import re
@@ -22,6 +23,8 @@ from pathlib import Path
 from typing import Any
 
 from conformance.commands.mutants import is_named
+from conformance.mutants import implementations
+from conformance.mutants.implementations import report as mutant_report
 from conformance.requirements import chapter_of, requirements
 from docs import backends, examples, third_party
 from dreamer_spec.report import catalogue
@@ -181,6 +184,29 @@ def _mutants_of(entries: dict[str, dict[str, Any]]) -> str:
     return markdown_table(["mutant", "mistake", "provenance", "violates", "fix", "caught by", "named"], rows)
 
 
+def implementation_mutant_kinds() -> str:
+    """What kinds of mistakes are planted in the implementations, and how many of each."""
+    kinds = collections.Counter(patch.kind for patch in implementations.patches().values())
+    rows = [[f"`{kind}`", meaning, str(kinds[kind])] for kind, meaning in implementations.KINDS.items()]
+    return markdown_table(["kind", "mistake", "mutants"], [*rows, ["all", "", str(kinds.total())]])
+
+
+def implementation_mutants() -> str:
+    """The committed run of `conformance mutants --implementations --json`, and what it missed."""
+    path = RESULTS / "implementation-mutants.json"
+    if not path.exists():
+        return f"No run of all of them is recorded yet (`{path.relative_to(ROOT)}`).\n"
+    found = json.loads(path.read_text(encoding="utf-8"))["mutants"]
+    rows = [[kind, *map(str, row)] for kind, row in mutant_report.counts(found).items()]
+    table = markdown_table(["kind", *mutant_report.COLUMNS], rows)
+    missed = [
+        [f"`{name}`", f"`{entry['file']}`", entry["explanation"].replace("|", "\\|")]
+        for name, entry in found.items()
+        if mutant_report.column_of(entry) == "survived"
+    ]
+    return table + ("\nSurvivors:\n\n" + markdown_table(["mutant", "file", "mistake"], missed) if missed else "")
+
+
 def train_step_table() -> str:
     """`make bench`, one line for each case."""
     report = json.loads((RESULTS / "train-step.json").read_text(encoding="utf-8"))
@@ -322,6 +348,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "conformance_chapters": conformance_chapters,
     "mutant_summary": mutant_summary,
     "mutants": mutant_tables,
+    "implementation_mutant_kinds": implementation_mutant_kinds,
+    "implementation_mutants": implementation_mutants,
     "train_step": train_step_table,
     "learning": learning_table,
     "replay_image": functools.partial(replay_table, "image"),

@@ -1,4 +1,4 @@
-"""Plant realistic mistakes in the reference one by one, and list the checks that catch each."""
+"""Plant realistic mistakes one by one, and list what catches each: checks, or preflight and tests too."""
 
 import argparse
 from collections.abc import Iterable
@@ -13,6 +13,7 @@ from conformance.diagnosis import Diagnosis, diagnose
 from conformance.errors import UserError
 from conformance.execute import Result, selected_checks
 from conformance.mutants import MUTANTS, Mutant, MutantAdapter, relevant, sound, trial
+from conformance.mutants.implementations import report as implementations
 from conformance.mutants.trial import setting_of_trials
 from conformance.results import versions, write
 
@@ -26,10 +27,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="check each as if it were a third-party implementation, and see whether it is named",
     )
+    parser.add_argument(
+        "--implementations",
+        nargs="*",
+        default=None,
+        metavar="NAME",
+        help="plant the mistakes of the backends, the learners and the trainer instead of those of the reference; all, "
+        "or those with this name, kind, file or catalogue. Takes hours, and a checkout",
+    )
     parser.add_argument("--json", type=Path, default=None, metavar="FILE", help="write the results to this file, too")
 
 
 def main(console: Console, options: argparse.Namespace) -> int:
+    if options.implementations is not None:
+        return implementations.main(console, options.implementations, options.json)
     mutants = [mutant for mutant in MUTANTS.values() if options.only in mutant.name]
     if not mutants:
         raise UserError(f"no mutant matches --only {options.only!r}")
