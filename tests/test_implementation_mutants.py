@@ -17,7 +17,7 @@ from conformance.mutants.implementations.trial import Outcome, Trials
 ROOT = Path(__file__).resolve().parent.parent
 PATCHES = patches()
 SAMPLE = ("hidden_norm_block_by_block", "logits_are_class_major", "hoisted_action_forgets_the_reset")
-# What nothing notices yet, of those that were judged: PyTorch's functions and its learner.
+# What nothing notices yet, of those that were judged: PyTorch's functions, its learner, and half of the trainer.
 SURVIVORS = (
     "large_products_in_bfloat16",
     "means_by_the_configured_batch_size",
@@ -36,6 +36,10 @@ SURVIVORS = (
     "slow_critic_moves_before_the_step",
     "prior_and_posterior_noise_from_one_seed",
     "train_noise_of_the_configured_batch",
+    "train_and_policy_share_seeds",
+    "random_workers_act_alike",
+    "replay_ratio_counts_repeated_actions",
+    "every_evaluation_plays_the_same_episodes",
 )
 
 
