@@ -1,11 +1,12 @@
 """Preflight: is this backend right on this very configuration, these spaces, this precision and this device?
 
-Small batch, few time steps, full-size networks: seconds for the small sizes. Networks are compared one by one on given
-states, so that any precision can be judged. In float64 and float32 whole losses and their gradient are compared too; in
-bfloat16 a sample may honestly fall into another class, after which nothing is comparable.
+Networks of full size are compared one by one on given states, so that any precision can be judged. In float64 and
+float32 follow whole losses and their gradient, of a few time steps and of a batch as large as the run's, and a train
+step of the learner; in bfloat16 a sample may honestly fall into another class, after which nothing is comparable.
 """
 
 import dataclasses
+import math
 import re
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -22,15 +23,21 @@ from conformance.problems import (
     random_carry,
     random_observations,
     random_parameters,
+    random_state,
     train_noise,
-    with_sampling_margin,
 )
 from conformance.script import Script
+from conformance.settled import settled
 from reference_numpy import agent, networks, rssm
-from spec import Config, Spaces
+from spec import Config, Spaces, parameter_table
 
 ROWS = 2
 STEPS = 2
+# Of a batch as large as the run's: imagined steps, which are as many as they are in the small one; multiplications and
+# additions that the reference may take for it, and time steps that it has in any case.
+HORIZON = 2
+OPERATIONS = 2e10
+LEAST_STEPS = 512
 SAMPLING_MARGIN = 1e-5
 # Far smaller than in the checks: a random network for images bends sharply, and here float64 loses 1e-8 of a derivative
 # at most.
@@ -96,10 +103,10 @@ def preflight_adapter(
     worst, agreed = 0.0, []
     parts = [("networks", compare_networks)]
     if config.compute_dtype in LOSS_BOUND:
-        parts += [("losses and gradient", compare_losses)]
+        parts += [("losses and gradient", compare_losses), ("learner", compare_learner), ("batch", compare_batch)]
     for name, part in parts:
         try:
-            for what, function in part(script, adapter, spaces, small):
+            for what, function in part(script, adapter, spaces, config if part is compare_batch else small):
                 agreed.append(
                     Agreement(what, re.findall(r"\[([A-Z]+-\d+)\]", function.__doc__ or ""), comparisons.worst.share)
                 )
@@ -143,35 +150,79 @@ def compare_losses(script: Script, adapter: object, spaces: Spaces, config: Conf
     """Every loss of a training step, and the derivative of the total along random directions, where the candidate has
     gradients."""
     problem = comparable_problem(script.setting.seed, spaces, config)
+    along = dict(directions(problem.state["params"], script.setting.seed))
+    yield from compare_problem(script, adapter, problem, along)
+
+
+def compare_batch(script: Script, adapter: object, spaces: Spaces, config: Config) -> Compared:
+    """The same of a batch as long as the run's, with as many rows of it as the reference takes seconds for, along one
+    direction: implementations compute many rows, images and steps in other ways than few."""
+    if not callable(getattr(adapter, "gradients", None)):
+        return
+    rows = rows_of_batch(spaces, config)
+    large = dataclasses.replace(config, batch_size=rows, imagination_horizon=min(HORIZON, config.imagination_horizon))
+    problem = settled(random_problem(script.setting.seed, spaces, large), SAMPLING_MARGIN)
+    label, direction = next(directions(problem.state["params"], script.setting.seed))
+    batch = f" of {rows} x {config.batch_length} steps"
+    for what, function in compare_problem(script, adapter, problem, {label: direction}):
+        yield what + batch, function
+
+
+def rows_of_batch(spaces: Spaces, config: Config) -> int:
+    """How many rows of the run's batch are compared."""
+    weights = sum(math.prod(entry.shape) for entry in parameter_table(config, spaces).values())
+    affordable = OPERATIONS / (weights * config.batch_length * (1 + HORIZON))
+    least = math.ceil(LEAST_STEPS / config.batch_length)
+    return min(config.batch_size, max(least, int(affordable)))
+
+
+def compare_learner(script: Script, adapter: object, spaces: Spaces, config: Config) -> Compared:
+    """A train step of the learner from the middle of training, its whole state after it, and acting with the new
+    parameters."""
+    if not callable(getattr(adapter, "Learner", None)):
+        return
+    from conformance.cases import learner as checks  # with all other checks, which takes a moment
+
+    problem = random_problem(script.setting.seed, spaces, config)
+    state = random_state(np.random.default_rng(script.setting.seed), config, spaces, "float32")
+    learner = checks.made(script, problem)
+    learner.load_state_dict(agent.flatten_state(state))
+    seed = checks.compare_step(script, learner, problem, 1, "train step", config, SAMPLING_MARGIN)
+    yield "train step of the learner", agent.train_step
+    checks.compare_acting(script, learner, problem, seed + 1, "after the train step")
+    yield "policy step of the learner", agent.policy_step
+
+
+def compare_problem(
+    script: Script, adapter: object, problem: Problem, along: dict[str, dict[str, np.ndarray]]
+) -> Compared:
+    """Every loss, and the derivative of the total along directions."""
+    dtype = script.setting.dtype
     total, aux = agent.losses(*problem.loss_arguments)
     actual_total, actual = script.call("losses", *problem.loss_arguments)
     size = max(1.0, *(abs(loss) for loss in aux["losses"].values()))
-    script.compare("losses", actual["losses"], aux["losses"], magnitude=size, bound=LOSS_BOUND[script.setting.dtype])
+    script.compare("losses", actual["losses"], aux["losses"], magnitude=size, bound=LOSS_BOUND[dtype])
     yield "losses", agent.losses
-    script.compare(
-        "total", actual_total, total, magnitude=max(size, abs(total)), bound=LOSS_BOUND[script.setting.dtype]
-    )
+    script.compare("total", actual_total, total, magnitude=max(size, abs(total)), bound=LOSS_BOUND[dtype])
     yield "total loss", agent.losses
 
     if not callable(getattr(adapter, "gradients", None)):
         return  # the reference itself
     gradients = script.call("gradients", *problem.loss_arguments)
     params, *others = problem.loss_arguments
-    weights = np.array([getattr(config, f"{name.partition('/')[0]}_scale") for name in aux["losses"]])
+    weights = np.array([getattr(problem.config, f"{name.partition('/')[0]}_scale") for name in aux["losses"]])
 
     def losses(point: Any) -> np.ndarray:
         return np.array(list(agent.losses(point, *others)[1]["losses"].values()))
 
-    for label, direction in directions(params, script.setting.seed):
+    for label, direction in along.items():
         # Loss by loss, so that what a direction does not reach cancels without rounding.
         derivative = agent.directional_derivative(losses, params, direction, DIFFERENCE_STEP) @ weights
         product = sum(float((np.asarray(gradients[name]) * along).sum()) for name, along in direction.items())
         # The size of such a product on average: by chance a product can be nearly 0, and its error is not.
         usual = np.sqrt(sum(float((np.asarray(gradients[name]) ** 2).mean()) for name in direction))
-        name = f"gradient along {label}"
-        script.compare(
-            name, product, derivative, magnitude=max(usual, abs(derivative)), bound=GRADIENT_BOUND[script.setting.dtype]
-        )
+        name, size = f"gradient along {label}", max(usual, abs(derivative))
+        script.compare(name, product, derivative, magnitude=size, bound=GRADIENT_BOUND[dtype])
         yield name, agent.directional_derivative
 
 
@@ -187,17 +238,18 @@ def directions(params: dict[str, np.ndarray], seed: int) -> Iterator[tuple[str, 
         yield label, {name: value / np.linalg.norm(value) for name, value in noise.items()}
 
 
-def comparable_problem(seed: int, spaces: Spaces, config: Config) -> Problem:
-    """A problem in which no sample lies so near a class boundary that honest rounding could move it across."""
+def random_problem(seed: int, spaces: Spaces, config: Config) -> Problem:
+    """A train step at random parameters."""
     rng = np.random.default_rng(seed)
     params = random_parameters(rng, config, spaces, "float32")
-    state: dict[str, Any] = {
+    state = {
         "params": params,
         "slow_critic": {name: value for name, value in params.items() if name.startswith("critic/")},
         "return_range": {"low": 0.0, "high": 2.0},
     }
+    return Problem(spaces, config, state, random_batch(rng, config, spaces), train_noise(rng, config, spaces))
 
-    def draw(attempt: int) -> Problem:
-        return Problem(spaces, config, state, random_batch(rng, config, spaces), train_noise(rng, config, spaces))
 
-    return with_sampling_margin(draw, SAMPLING_MARGIN, attempts=100)
+def comparable_problem(seed: int, spaces: Spaces, config: Config) -> Problem:
+    """A problem in which no sample lies so near a class boundary that honest rounding could move it across."""
+    return settled(random_problem(seed, spaces, config), SAMPLING_MARGIN)

@@ -32,7 +32,7 @@ def away_from_boundaries(uniform: np.ndarray, log_probs: np.ndarray, margin: flo
     less than the margin, or by as much as the likeliest class allows."""
     boundaries = np.cumsum(np.exp(log_probs), -1)[..., :-1]
     near = np.abs(boundaries - uniform[..., None]).min(-1, initial=np.inf) < margin
-    edges = np.concatenate([np.zeros_like(boundaries[..., :1]), boundaries, np.ones_like(boundaries[..., :1])], -1)
+    edges = np.insert(np.insert(boundaries, 0, 0.0, -1), log_probs.shape[-1], 1.0, -1)  # [..., C + 1]
     widest = np.diff(edges).argmax(-1)[..., None]
     middle = (np.take_along_axis(edges, widest, -1) + np.take_along_axis(edges, widest + 1, -1))[..., 0] / 2
     return np.where(near, round_to(middle, "float32"), uniform)

@@ -21,9 +21,11 @@ QUICK = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
 
 def pytest_configure(config: pytest.Config) -> None:
     """JAX compiles without optimizations that take longer than the tests' small programs, and each program once for all
-    processes of a session."""
+    processes of a session. Small products take one thread: several, in several processes, wait for each other."""
     if hasattr(config, "workerinput"):
         return  # of pytest-xdist: it has the environment already
+    for library in ("OMP", "MKL", "OPENBLAS"):
+        os.environ.setdefault(f"{library}_NUM_THREADS", "1")
     folder = tempfile.TemporaryDirectory(prefix="compiled-")
     config.add_cleanup(folder.cleanup)
     os.environ |= {"JAX_COMPILATION_CACHE_DIR": folder.name, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}

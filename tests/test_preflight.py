@@ -1,5 +1,6 @@
 """Preflight refuses backends that are nearly right, and only them."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -11,14 +12,17 @@ from conformance.adapter import load_adapter
 from conformance.mutants import PlantedAdapter
 from conformance.preflight import preflight, preflight_adapter
 from conformance.problems import Problem, make_problem, with_sampling_margin
+from impl_torch.learner import Learner
+from impl_torch.rssm import freeze
 from reference_numpy import layers
 from spec import Config, Discrete, Image, Spaces, Vector, load_config
 
 SPACES = Spaces({"position": Vector(3), "image": Image(16, 16, 1)}, {"move": Vector(2), "button": Discrete((3,))})
 
 
-def config(dtype: str) -> Config:
-    return load_config("paper", "tiny", compute_dtype=dtype)
+def config(dtype: str, **overrides: Any) -> Config:
+    batch = {"batch_size": 2, "batch_length": 8, "imagination_horizon": 3}
+    return load_config("paper", "tiny", compute_dtype=dtype, **{**batch, **overrides})
 
 
 class ChangedGradients:
@@ -86,6 +90,53 @@ def test_a_gradient_that_is_not_finite_is_seen() -> None:
         }
 
     assert not preflight_adapter(ChangedGradients("float64", spoiled), SPACES, config("float64")).passed
+
+
+def test_a_mistake_with_many_rows_is_seen() -> None:
+    """The last row of a large batch does not count."""
+
+    class Wrong(ChangedGradients):
+        def gradients(self, *arguments: Any) -> dict[str, np.ndarray]:
+            *before, batch, noise, spaces, config = arguments
+            if batch["reward"].size >= 32:
+                length, kept = config.batch_length, config.batch_size - 1
+                batch = {name: value[:kept] for name, value in batch.items()}
+                starts = {name: noise[name][: kept * length] for name in ("prior", "action")}
+                noise = {"posterior": noise["posterior"][:kept], **starts}
+            return self._right.gradients(*before, batch, noise, spaces, config)  # type: ignore[attr-defined]
+
+    report = preflight_adapter(Wrong("float32", dict), SPACES, config("float32", batch_size=4))
+    assert not report.passed
+    assert report.summary.startswith("batch: gradient along all parameters")
+
+
+def test_a_mistake_of_the_learner_is_seen() -> None:
+    class Stale(Learner):
+        def train_step(self, batch: Any, seed: int) -> Any:
+            cached = self._acting or freeze(self.parameters.mapping(), self.config)
+            cached = {name: value.clone() for name, value in cached.items()}
+            result = super().train_step(batch, seed)
+            self._acting = cached
+            return result
+
+    class Wrong(ChangedGradients):
+        def Learner(self, spaces: Spaces, config: Config, seed: int) -> Learner:  # noqa: N802
+            return Stale(spaces, config, seed=seed)
+
+    far = config("float32", learning_rate=0.1, warmup_steps=0)
+    assert preflight_adapter(ChangedGradients("float32", dict), SPACES, far).passed
+    report = preflight_adapter(Wrong("float32", dict), SPACES, far)
+    assert not report.passed
+    assert report.summary.startswith("learner: after the train step, acting step 0")
+
+
+def test_a_batch_has_as_many_rows_as_take_seconds() -> None:
+    """All of a small network; of a large one at least 512 steps."""
+    assert module.rows_of_batch(SPACES, load_config("paper", "tiny")) == 16
+    large = load_config("paper", "400m")
+    assert module.rows_of_batch(SPACES, large) == 8
+    assert module.rows_of_batch(SPACES, dataclasses.replace(large, batch_length=100)) == 6
+    assert module.rows_of_batch(SPACES, dataclasses.replace(large, batch_size=2)) == 2
 
 
 def tf32(x: Any) -> np.ndarray:

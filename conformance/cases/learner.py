@@ -22,7 +22,7 @@ from conformance.problems import Problem, make_problem, nudged, random_observati
 from conformance.script import Script
 from conformance.statistics import confidence, normal_cdf
 from reference_numpy import agent as reference
-from spec import Discrete, Spaces, parameter_table
+from spec import Config, Discrete, Spaces, parameter_table
 
 SEEDS = 100  # tried until rounding moves no sample of a train step into another class
 ROWS = 3  # environments that act
@@ -43,11 +43,10 @@ def small_problem(script: Script) -> Problem:
     return make_problem(setting.seed, setting.profile, "both", "mixed", setting.dtype, **options)
 
 
-def gradients_of(script: Script, problem: Problem) -> Any:
-    """By the candidate's function, at the options of the other checks, which differ in the optimizer alone: what is
+def usual_config(script: Script) -> Config:
+    """The options of the other checks, which differ from those here in the optimizer alone: the gradient that is
     compiled for them serves here too."""
-    usual = make_problem(script.setting.seed, script.setting.profile, "both", "mixed", script.setting.dtype).config
-    return script.call("gradients", *dataclasses.replace(problem, config=usual).loss_arguments)
+    return make_problem(script.setting.seed, script.setting.profile, "both", "mixed", script.setting.dtype).config
 
 
 def state_of(learner: Any, problem: Problem) -> dict[str, Any]:
@@ -58,24 +57,34 @@ def as_problem(problem: Problem, state: dict[str, Any], noise: Any) -> Problem:
     return dataclasses.replace(problem, state=state, noise={name: np.asarray(x) for name, x in noise.items()})
 
 
-def with_margin(learner: Any, problem: Problem, first: int) -> tuple[int, Problem]:
+def with_margin(learner: Any, problem: Problem, first: int, margin: float) -> tuple[int, Problem]:
     """The first seed with which no sample lies near a boundary, and the problem with its noise."""
     state = state_of(learner, problem)
     for seed in range(first, first + SEEDS):
         tried = as_problem(problem, state, learner.train_noise(problem.batch, seed))
         below, here, above = (
-            reference.losses(*nudged(tried, distance).loss_arguments)[0]
-            for distance in (-SAMPLING_MARGIN, 0.0, SAMPLING_MARGIN)
+            reference.losses(*nudged(tried, distance).loss_arguments)[0] for distance in (-margin, 0.0, margin)
         )
         if below == here == above:
             return seed, tried
-    raise RuntimeError(f"none of {SEEDS} seeds keeps every sample {SAMPLING_MARGIN:g} away from the next class")
+    raise RuntimeError(f"none of {SEEDS} seeds keeps every sample {margin:g} away from the next class")
 
 
-def compare_step(script: Script, learner: Any, problem: Problem, first: int, where: str) -> int:
-    """One train step from the learner's present state against the reference; returns its seed."""
-    seed, problem = with_margin(learner, problem, first)
-    gradients = gradients_of(script, problem)
+def compare_step(
+    script: Script,
+    learner: Any,
+    problem: Problem,
+    first: int,
+    where: str,
+    config: Config,
+    margin: float = SAMPLING_MARGIN,
+) -> int:
+    """One train step from the learner's present state against the reference; returns its seed.
+
+    config: with which the candidate is asked for the gradient. margin: see `with_sampling_margin`.
+    """
+    seed, problem = with_margin(learner, problem, first, margin)
+    gradients = script.call("gradients", *dataclasses.replace(problem, config=config).loss_arguments)
     metrics, latents = learner.train_step(problem.batch, seed)
     inputs = (problem.state, problem.batch, problem.noise, gradients, problem.spaces, problem.config)
     new, aux = reference.train_step(*inputs)
@@ -133,13 +142,14 @@ def train_steps_match(script: Script) -> None:
     learner = made(script, problem)
     fresh = state_of(learner, problem)
     compare_states(script, learner, dataclasses.replace(problem, state=fresh), fresh_like(fresh), "fresh", 1e-6)
-    seed = compare_step(script, learner, problem, 1, "first train step")
-    compare_step(script, learner, problem, seed + 1, "second train step")
+    config = usual_config(script)
+    seed = compare_step(script, learner, problem, 1, "first train step", config)
+    compare_step(script, learner, problem, seed + 1, "second train step", config)
     rng = np.random.default_rng(script.setting.seed)
     learner.load_state_dict(
         reference.flatten_state(random_state(rng, problem.config, problem.spaces, script.setting.dtype))
     )
-    compare_step(script, learner, problem, seed + SEEDS, "train step from the middle")
+    compare_step(script, learner, problem, seed + SEEDS, "train step from the middle", config)
 
 
 def fresh_like(state: dict[str, Any]) -> dict[str, Any]:
