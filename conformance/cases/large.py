@@ -90,8 +90,7 @@ def losses_of_another_batch_match(setting: Setting) -> Cases:
     """Every loss, metric and latent of a batch with fewer rows and steps than the configuration says: what counts is
     the batch."""
     problem = problem_of(setting, "vector", "discrete")
-    sizes = {"batch_size": 7, "batch_length": 11}
-    other = dataclasses.replace(problem, config=dataclasses.replace(problem.config, **sizes))
+    other = dataclasses.replace(problem, config=dataclasses.replace(problem.config, batch_size=7, batch_length=11))
     demands = demands_of(Example(other, setting.seed), "", bound_of(setting, 1e-9, 2e-4))
     yield judged("losses", other.loss_arguments, *demands.values())
 
