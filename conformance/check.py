@@ -31,6 +31,12 @@ class Check:
     cases: Callable[[Setting], Cases] | None = None
     script: Callable[[Script], None] | None = None
 
+    @property
+    def is_large(self) -> bool:
+        """Whether it asks again what others ask, at many times the work: of fast implementations, not of mutants of the
+        reference."""
+        return self.name.startswith("large.")
+
 
 CHECKS: dict[str, Check] = {}
 

@@ -52,13 +52,15 @@ class Diagnosis:
 
     explained: names of the failing checks in which its results are those of the mutant. unexplained: of the other
     failing checks that can be compared. alternatives: mutants that explain the same checks and cannot be told apart by
-    any other.
+    any other. refuted_by: a check that the candidate passes and the mutant does not: it is only the nearest that is
+    known; "" where there is none.
     """
 
     mutant: Mutant
     explained: tuple[str, ...]
     unexplained: tuple[str, ...]
     alternatives: tuple[Mutant, ...] = ()
+    refuted_by: str = ""
 
     def to_json(self) -> dict[str, Any]:
         """As the reports take it: conformance/report.schema.json."""
@@ -72,6 +74,7 @@ class Diagnosis:
             "explained": list(self.explained),
             "unexplained": list(self.unexplained),
             "alternatives": [mutant.name for mutant in self.alternatives],
+            "refuted_by": self.refuted_by,
         }
 
 
@@ -90,7 +93,7 @@ def diagnose(adapter: object, results: Iterable[Result], setting: Setting, watch
     """
     results = list(results)
     candidate = _Candidate(adapter, setting, {result.check.name: result.status for result in results})
-    failing = [result.check for result in results if result.status in ("fail", "error")]
+    failing = [result.check for result in results if result.status in FAILING and not result.check.is_large]
     failing.sort(key=lambda check: (check.level, _of_derivatives(check), candidate.size(check), check.name))
     traces = {check: trace for check in watch("diagnosis, recording", failing) if (trace := candidate.trace(check))}
     # What is compared soonest and says most comes first: derivatives are slow, extreme input is special.
@@ -99,15 +102,15 @@ def diagnose(adapter: object, results: Iterable[Result], setting: Setting, watch
         mutant: {check for check, trace in evidence.items() if candidate.explains(mutant, check, trace)}
         for mutant in _suspects(candidate, evidence, watch)
     }
-    passing = [result.check for result in results if result.status == "pass"]
+    passing = [result.check for result in results if result.status == "pass" and not result.check.is_large]
     diagnoses: list[Diagnosis] = []
     left = set(evidence)
     while explained := {mutant: checks for mutant, checks in explained.items() if checks & left}:
-        first, *others = _best(candidate, explained, passing)
+        (first, *others), refuted_by = _best(candidate, explained, passing)
         known = tuple(check.name for check in evidence if check in explained[first])
         unknown = tuple(check.name for check in evidence if check not in explained[first])
         alternatives = tuple(mutant for mutant in others if explained[mutant] == explained[first])
-        diagnoses.append(Diagnosis(first, known, unknown, alternatives))
+        diagnoses.append(Diagnosis(first, known, unknown, alternatives, refuted_by))
         left -= explained[first]
     return diagnoses
 
@@ -127,17 +130,31 @@ def _suspects(candidate: "_Candidate", evidence: dict[Check, "_Trace"], watch: W
     return found
 
 
-def _best(candidate: "_Candidate", explained: dict[Mutant, set[Check]], passing: list[Check]) -> list[Mutant]:
-    """The mutants that explain most checks; of several, those that no passing check speaks against, if there are
-    such."""
-    most = max(map(len, explained.values()))
-    tied = [mutant for mutant, checks in explained.items() if len(checks) == most]
+def _best(
+    candidate: "_Candidate", explained: dict[Mutant, set[Check]], passing: list[Check]
+) -> tuple[list[Mutant], str]:
+    """Of the mutants that no passing check speaks against those that explain most checks; where there are none, of all,
+    and a check that does."""
+    counts = sorted({len(checks) for checks in explained.values()}, reverse=True)
+    groups = [
+        _likeliest(candidate, [mutant for mutant, checks in explained.items() if len(checks) == count], explained)
+        for count in counts
+    ]
+    for group in groups:
+        if possible := [mutant for mutant in group if not candidate.contradiction(mutant, passing)]:
+            return possible, ""
+    return groups[0], candidate.contradiction(groups[0][0], passing)
+
+
+def _likeliest(
+    candidate: "_Candidate", tied: list[Mutant], explained: Mapping[Mutant, Collection[Check]]
+) -> list[Mutant]:
+    """Of several those that also agree after the first deviation, if there are such."""
     if len(tied) == 1:
         return tied
-    tied = [
+    return [
         mutant for mutant in tied if all(candidate.follows_to_the_end(mutant, check) for check in explained[mutant])
     ] or tied
-    return [mutant for mutant in tied if not candidate.contradicts(mutant, passing)] or tied
 
 
 @dataclasses.dataclass
@@ -194,11 +211,11 @@ class _Candidate:
             self._explained[key] = follows
         return self._explained[key]
 
-    def contradicts(self, mutant: Mutant, passing: list[Check]) -> bool:
-        """Whether a check that the candidate passes fails on the mutant."""
+    def contradiction(self, mutant: Mutant, passing: list[Check]) -> str:
+        """The name of a check that the candidate passes and the mutant does not; "" if there is none."""
         chapters = {target.partition(".")[0] for target in mutant.edits}
         nearest = sorted(passing, key=lambda check: check.name.partition(".")[0] not in chapters)
-        return any(self._fails(mutant, check) for check in nearest)
+        return next((check.name for check in nearest if self._fails(mutant, check)), "")
 
     def follows_to_the_end(self, mutant: Mutant, check: Check) -> bool:
         if check.name not in self._whole:

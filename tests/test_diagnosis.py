@@ -107,6 +107,18 @@ def test_passing_checks_tell_mutants_apart(monkeypatch: pytest.MonkeyPatch) -> N
     assert (found.mutant, found.alternatives) == (slow, ())
 
 
+def test_a_mutant_that_a_passing_check_refutes_is_only_the_nearest(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The candidate has the slow critic of the mutant, and not its other mistake."""
+    slow, returns = MUTANTS["slow_critic_decay_swapped"], MUTANTS["return_without_discount"]
+    both = dataclasses.replace(slow, name="both", edits={**slow.edits, **returns.edits})
+    monkeypatch.delitem(MUTANTS, slow.name)
+    monkeypatch.setitem(MUTANTS, "both", both)
+    (found,) = diagnose_in(MutantAdapter(slow), "behavior.slow_critic", "returns.lambda_return_literals")
+    assert (found.mutant, found.refuted_by) == (both, "returns.lambda_return_literals")
+    (found,) = diagnose_in(MutantAdapter(slow), "behavior.slow_critic")
+    assert (found.mutant, found.refuted_by) == (both, "")
+
+
 class Strange:
     """An implementation whose symlog is wrong in a way of its own."""
 
@@ -156,4 +168,5 @@ def test_the_words_of_a_diagnosis() -> None:
         "explained": ["returns.lambda_return_literals"],
         "unexplained": [],
         "alternatives": [],
+        "refuted_by": "",
     }

@@ -19,13 +19,6 @@ PATCHES = patches()
 SAMPLE = ("hidden_norm_block_by_block", "logits_are_class_major", "hoisted_action_forgets_the_reset")
 # What nothing notices yet, of those that were judged: PyTorch's functions, its learner, and half of the trainer.
 SURVIVORS = (
-    "large_products_in_bfloat16",
-    "means_by_the_configured_batch_size",
-    "annotation_by_the_configured_length",
-    "percentiles_of_the_configured_number_of_returns",
-    "many_rows_read_blocks_untransposed",
-    "many_rows_forget_the_bias",
-    "image_chunks_in_reverse_order",
     "last_image_chunk_is_shifted",
     "optimizer_drops_the_last_chunk",
     "later_chunks_are_later_steps",
@@ -33,8 +26,6 @@ SURVIVORS = (
     "layouts_are_kept_by_name",
     "deeper_layers_get_the_first_scales_gradient",
     "convolution_bias_gradient_counts_twice",
-    "slow_critic_moves_before_the_step",
-    "prior_and_posterior_noise_from_one_seed",
     "train_noise_of_the_configured_batch",
     "train_and_policy_share_seeds",
     "random_workers_act_alike",

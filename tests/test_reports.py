@@ -117,6 +117,17 @@ def test_without_a_diagnosis_the_reports_say_so(
     assert told not in shown(data)
 
 
+def test_what_no_mistake_explains_is_said(data: dict[str, Any]) -> None:
+    failing = [name for name, check in data["checks"].items() if check["status"] in ("fail", "error")]
+    explained = {name for diagnosis in data["diagnoses"] for name in diagnosis["explained"]}
+    left = [name for name in failing if name not in explained]
+    without = {**data, "diagnoses": []}
+    told = f"No known mistake fits {', '.join(failing)}."
+    for text in (html.render([without]), shown(without)):
+        assert told in text
+    assert ("No known mistake fits" in shown(data)) == bool(left)
+
+
 def test_markdown(data: dict[str, Any]) -> None:
     text = markdown.render(data)
     assert text.startswith("# Conformance of mine 1.2\n\n**Failed: 2 checks fail.**")

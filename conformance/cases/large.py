@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from conformance.case import Cases, Equal, Setting, exactly, judged, related
-from conformance.cases.agent import SAMPLING_MARGIN, WHOLE, Example, bound_of, gradient_along
+from conformance.cases.agent import SAMPLING_MARGIN, WHOLE, Example, bound_of, gradient_along, problem_of
 from conformance.cases.losses import demands_of
 from conformance.check import check
 from conformance.compare import Comparisons
@@ -83,6 +83,16 @@ def gradient_of_a_batch_is_that_of_its_rows(setting: Setting) -> Cases:
         gradient_along(c, example, whole, ["all", "all, again"], bound_of(setting, 1e-5, 5e-3))
 
     yield related(mean_of_rows, *(("gradients", one.loss_arguments) for one in (problem, *rows)))
+
+
+@check("AGT-15", "AGT-26", "RET-11", "RET-14", "CON-20", uses=["losses"], level=2, dtypes=WHOLE)
+def losses_of_another_batch_match(setting: Setting) -> Cases:
+    """Every loss, metric and latent of a batch with fewer rows and steps than the configuration says: what counts is
+    the batch."""
+    problem = problem_of(setting, "vector", "discrete")
+    other = dataclasses.replace(problem, config=dataclasses.replace(problem.config, batch_size=7, batch_length=11))
+    demands = demands_of(Example(other, setting.seed), "", bound_of(setting, 1e-9, 2e-4))
+    yield judged("losses", other.loss_arguments, *demands.values())
 
 
 @check(*BATCH, uses=["losses"], level=2, dtypes=WHOLE)

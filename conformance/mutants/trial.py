@@ -66,7 +66,7 @@ def sound(checks: Iterable[Check], examples: int = 5) -> tuple[dict[Check, froze
 
     A check that the reference does not pass would catch anything, so it says nothing about a mutant.
     """
-    found = [on_the_reference(check, setting_of_trials(examples)) for check in checks]
+    found = [on_the_reference(check, setting_of_trials(examples)) for check in checks if not check.is_large]
     reach = {result.check: entered for result, entered in found if result.status == "pass"}
     return reach, [result for result, _ in found if result.status in ("fail", "error")]
 

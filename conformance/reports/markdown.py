@@ -70,6 +70,11 @@ def _diagnoses(data: Data) -> list[str]:
         f"{chapter(found['chapter'])}. {text(found['fix'])} "
         f"Explains {', '.join(map(code, found['explained']))}."
         + (f" Known from: {text(found['provenance'])}." if found["provenance"] else "")
+        + (
+            f" Only the nearest: it would fail {code(refuted)}, which passes."
+            if (refuted := found.get("refuted_by"))
+            else ""
+        )
         for found in summary.diagnoses(data)
     ]
     return ["## It behaves like", "\n".join(lines)] if lines else []

@@ -20,6 +20,7 @@ EXTREME = "fail at extremes"
 STATUSES = ("pass", "fail", "error", EXTREME, "expected failure", "partly offered", "not offered", "not in edition")
 """As told: a failure may be only with extreme input, or expected; of a requirement, some checks may be offered and
 others not."""
+NAMED = 3  # checks that a line names
 UNMEASURED = "not measurable"
 SCALE = (
     "The worst deviation, as a share of the allowed one: 100% is the limit, and 20× is twenty times as much. "
@@ -226,8 +227,19 @@ def unchecked(data: Data) -> list[str]:
 
 def notes(data: Data) -> list[str]:
     """What is to be known of a run beside its outcome: sentences."""
-    undiagnosed = ["No diagnosis was made (--no-diagnosis)."] if data["diagnoses"] is None else []
-    return [*edition(data), *unchecked(data), *undiagnosed]
+    return [*edition(data), *unchecked(data), *undiagnosed(data)]
+
+
+def undiagnosed(data: Data) -> list[str]:
+    """A line, if any: which failures no known mistake explains."""
+    if data["diagnoses"] is None:
+        return ["No diagnosis was made (--no-diagnosis)."]
+    failing = [name for name, check in data["checks"].items() if check["status"] in FAILING]
+    left = [name for name in failing if not matching(data, name)]
+    if not left:
+        return []
+    others = f" and {len(left) - NAMED} others" if len(left) > NAMED else ""
+    return [f"No known mistake fits {', '.join(left[:NAMED])}{others}."]
 
 
 def tally(data: Data) -> str:
@@ -268,6 +280,11 @@ def checks_of(data: Data, requirement: str, statuses: Collection[str] = STATUSES
 def diagnoses(data: Data) -> list[Data]:
     """The mistakes recognized."""
     return list(data["diagnoses"] or ())
+
+
+def likeness(diagnosis: Data) -> str:
+    """Words before the name of a mutant."""
+    return "nearest known mistake:" if diagnosis.get("refuted_by") else "behaves like"
 
 
 def matching(data: Data, check: str) -> list[Data]:

@@ -79,12 +79,15 @@ def _chapters(console: Console, data: Data) -> None:
 
 def _diagnosis(console: Console, diagnosis: Data) -> None:
     console.print(
-        f"\n[bold]behaves like {escape(diagnosis['mutant'])}[/]: {escape(diagnosis['explanation'])}", highlight=False
+        f"\n[bold]{summary.likeness(diagnosis)} {escape(diagnosis['mutant'])}[/]: {escape(diagnosis['explanation'])}",
+        highlight=False,
     )
     if diagnosis["provenance"]:
         _plain(console, f"  known from: {diagnosis['provenance']}")
     _plain(console, f"  see {diagnosis['chapter']}. {diagnosis['fix']}")
     _plain(console, f"  explains {', '.join(diagnosis['explained'])}")
+    if diagnosis.get("refuted_by"):
+        _plain(console, f"  but it would fail {diagnosis['refuted_by']}, which passes")
     if diagnosis["alternatives"]:
         _plain(console, f"  cannot be told from {', '.join(diagnosis['alternatives'])}")
 
