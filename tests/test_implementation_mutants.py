@@ -20,11 +20,7 @@ SAMPLE = ("hidden_norm_block_by_block", "logits_are_class_major", "hoisted_actio
 # What nothing notices yet, of those that were judged: PyTorch's functions, its learner, and half of the trainer.
 SURVIVORS = (
     "last_image_chunk_is_shifted",
-    "optimizer_drops_the_last_chunk",
-    "later_chunks_are_later_steps",
-    "norms_are_folded_once",
     "layouts_are_kept_by_name",
-    "deeper_layers_get_the_first_scales_gradient",
     "convolution_bias_gradient_counts_twice",
     "train_noise_of_the_configured_batch",
     "train_and_policy_share_seeds",
