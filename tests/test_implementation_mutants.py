@@ -19,10 +19,6 @@ PATCHES = patches()
 SAMPLE = ("hidden_norm_block_by_block", "logits_are_class_major", "hoisted_action_forgets_the_reset")
 # What nothing notices yet, of those that were judged: PyTorch's functions, its learner, and half of the trainer.
 SURVIVORS = (
-    "last_image_chunk_is_shifted",
-    "layouts_are_kept_by_name",
-    "convolution_bias_gradient_counts_twice",
-    "train_noise_of_the_configured_batch",
     "train_and_policy_share_seeds",
     "random_workers_act_alike",
     "replay_ratio_counts_repeated_actions",

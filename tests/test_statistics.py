@@ -47,7 +47,9 @@ class Sampling(NumpyAdapter):
             self.policy_noise = print
 
         def train_noise(self, batch: Any, seed: int) -> dict[str, np.ndarray]:
-            return train_noise(np.random.default_rng(seed), self.config, self.task)
+            rows, steps = batch["reward"].shape
+            config = dataclasses.replace(self.config, batch_size=rows, batch_length=steps)
+            return train_noise(np.random.default_rng(seed), config, self.task)
 
 
 def offering(**functions: Any) -> types.SimpleNamespace:

@@ -207,7 +207,9 @@ def noise_is_independent(script: Script) -> None:
     sizes = {"batch_size": 16, "batch_length": 32, "imagination_horizon": 15}
     setting, task = script.setting, spaces("vector", "mixed")
     problem = make_problem(setting.seed, setting.profile, "vector", "mixed", setting.dtype, **sizes)
-    learner, config = made(script, problem), problem.config
+    config = problem.config
+    # The batch is not the configured one: what counts is the batch.
+    learner = made(script, dataclasses.replace(problem, config=dataclasses.replace(config, batch_size=7)))
     starts = config.batch_size * config.batch_length
     shapes = {
         "posterior": (config.batch_size, config.batch_length, config.stoch),
