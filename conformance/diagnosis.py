@@ -136,14 +136,14 @@ def _best(
     """Of the mutants that no passing check speaks against those that explain most checks; where there are none, of all,
     and a check that does."""
     counts = sorted({len(checks) for checks in explained.values()}, reverse=True)
-    groups = [
-        _likeliest(candidate, [mutant for mutant, checks in explained.items() if len(checks) == count], explained)
-        for count in counts
-    ]
-    for group in groups:
+    nearest: list[Mutant] = []
+    for count in counts:
+        tied = [mutant for mutant, checks in explained.items() if len(checks) == count]
+        group = _likeliest(candidate, tied, explained)
+        nearest = nearest or group
         if possible := [mutant for mutant in group if not candidate.contradiction(mutant, passing)]:
             return possible, ""
-    return groups[0], candidate.contradiction(groups[0][0], passing)
+    return nearest, candidate.contradiction(nearest[0], passing)
 
 
 def _likeliest(

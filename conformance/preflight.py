@@ -100,13 +100,16 @@ def preflight_adapter(
     small = dataclasses.replace(config, batch_size=ROWS, batch_length=STEPS, imagination_horizon=STEPS)
     comparisons = Comparisons(config.compute_dtype)
     script = Script(Setting(config.compute_dtype, "", seed), asking(adapter), comparisons)
-    worst, agreed = 0.0, []
-    parts = [("networks", compare_networks)]
+    worst, agreed = 0.0, list[Agreement]()
+    parts = [("networks", compare_networks, small)]
     if config.compute_dtype in LOSS_BOUND:
-        parts += [("losses and gradient", compare_losses), ("learner", compare_learner), ("batch", compare_batch)]
-    for name, part in parts:
+        parts += [("losses and gradient", compare_losses, small), ("learner", compare_learner, small)]
+        parts += [("batch", compare_batch, config)]
+    names = []  # of what the adapter offers
+    for name, part, sizes in parts:
+        before = len(agreed)
         try:
-            for what, function in part(script, adapter, spaces, config if part is compare_batch else small):
+            for what, function in part(script, adapter, spaces, sizes):
                 agreed.append(
                     Agreement(what, re.findall(r"\[([A-Z]+-\d+)\]", function.__doc__ or ""), comparisons.worst.share)
                 )
@@ -114,8 +117,10 @@ def preflight_adapter(
                 progress(what)
         except Deviation as deviation:
             return Report(False, comparisons.worst.deviation, f"{name}: {deviation}", agreed)
-    names = ", ".join(name for name, _ in parts)
-    summary = f"{names} agree with the reference in {config.compute_dtype}, {comparisons.compared:,} numbers compared"
+        if len(agreed) > before:
+            names.append(name)
+    compared = f"{comparisons.compared:,} numbers compared"
+    summary = f"{', '.join(names)} agree with the reference in {config.compute_dtype}, {compared}"
     return Report(True, worst, summary, agreed)
 
 

@@ -124,7 +124,8 @@ def test_every_tuple_has_names() -> None:
 
 
 def lambda_return(reward: Any, continue_: Any, value: Any, discount: float, lambda_: float) -> Any:
-    return load_adapter("numpy").lambda_return(reward, continue_, value, discount, lambda_)  # type: ignore[attr-defined]
+    reference: Any = load_adapter("numpy")
+    return reference.lambda_return(reward, continue_, value, discount, lambda_)
 
 
 def test_shapes_are_explained() -> None:

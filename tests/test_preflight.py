@@ -49,7 +49,10 @@ def test_a_right_backend_passes(dtype: str) -> None:
     assert all(one.requirements and 0 <= one.share <= 1 for one in report.comparisons)
     assert {"NET-2", "NET-12"} <= set(named["encoder"].requirements)
     assert len({one.share for one in report.comparisons}) > 5, "each has a share of its own"
-    assert preflight("numpy", SPACES, config(dtype)).passed
+    reference = preflight("numpy", SPACES, config(dtype))
+    assert reference.passed
+    assert "learner" not in reference.summary  # it has none
+    assert "batch" not in reference.summary  # nor gradients
 
 
 def test_it_tells_what_agrees_as_soon_as_it_does() -> None:

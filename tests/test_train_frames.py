@@ -24,7 +24,8 @@ class Skipping(train_fakes.Counting):
 @pytest.fixture(autouse=True)
 def registered() -> Any:
     for version, frameskip in enumerate((4, (2, 5), 1)):
-        spec = EnvSpec(id=f"Skipping{version}-v0", entry_point=Skipping, kwargs={"frameskip": frameskip})  # type: ignore[arg-type]
+        entry_point: Any = Skipping
+        spec = EnvSpec(id=f"Skipping{version}-v0", entry_point=entry_point, kwargs={"frameskip": frameskip})
         gymnasium.registry[spec.id] = spec
     yield
     for version in range(3):

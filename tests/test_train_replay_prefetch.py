@@ -94,7 +94,8 @@ def test_latents_are_written_back_before_the_draw_after_next() -> None:
     ready, events = threading.Event(), []
     sample, write_back = buffer.replay.sample, buffer.replay.write_back
     buffer.replay.sample = lambda *args: (events.append("draw"), sample(*args))[1]  # type: ignore[method-assign]
-    buffer.replay.write_back = lambda *args: (events.append("write"), write_back(*args))[1]  # type: ignore[method-assign]
+    replay: Any = buffer.replay
+    replay.write_back = lambda *args: (events.append("write"), write_back(*args))[1]
     first = buffer.take()
     buffer.write_back(first["ids"], {key: Slow(value, ready) for key, value in fresh(0).items()})
     second = buffer.take()  # Drawn already: it does not wait for the latents of the first.

@@ -27,7 +27,7 @@ QUICK = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": Fal
 OPTIMIZED = {"xla_backend_optimization_level": 3, "xla_cpu_use_fusion_emitters": True}
 # From so many time steps on, the gradient of the total alone is compiled apart from those of every loss: it takes a
 # tenth of the time, which for small batches is less than compiling.
-LARGE = 64
+LARGE = 32
 CANCELLING = {module.__name__ for module in (transforms, distributions, returns)}
 
 

@@ -164,7 +164,8 @@ def losses_with_unusual_options_match(setting: Setting) -> Cases:
     every kind of action."""
     for number in range(UNUSUAL):
         example = unusual_example(setting.seed, number, setting.profile, setting.dtype)
-        demands = demands_of(example, f"options {number}: ", bound_of(setting, 1e-9, 2e-4))
+        reach = max(1.0, *map(abs, example.losses[1]["return_range"]))
+        demands = demands_of(example, f"options {number}: ", bound_of(setting, 1e-9, 2e-4), reach)
         yield judged("losses", example.problem.loss_arguments, *demands.values())
 
 
@@ -172,6 +173,7 @@ def losses_with_unusual_options_match(setting: Setting) -> Cases:
 def every_tensor_has_its_gradient(setting: Setting) -> Cases:
     """The gradient of every tensor along itself and along random signs, in every precision, where every option is
     drawn: its length is right then, and so is its angle."""
+    # In bfloat16 layers of 8 to 12 units err by up to 0.16 of a gradient in PyTorch, over 8 seeds and both profiles.
     bound = {"float64": 1e-5, "float32": 1e-3, "bfloat16": 0.3}[setting.dtype]
     # In bfloat16 layer by layer: a sum over more would hide one tensor behind the rounding of the others.
     group = (lambda name: name.rpartition("/")[0]) if setting.dtype == "bfloat16" else (lambda name: name.split("/")[0])

@@ -23,7 +23,7 @@ from reference_numpy import optimizer
 from spec import Discrete, Image, Spaces, Vector
 
 RUN = {"batch_size": 17, "batch_length": 61, "imagination_horizon": 15}
-EQUAL = {**dict.fromkeys(("batch_size", "batch_length", "imagination_horizon", "stoch", "classes", "blocks"), 4)}
+EQUAL = dict.fromkeys(("batch_size", "batch_length", "imagination_horizon", "stoch", "classes", "blocks"), 4)
 EQUAL_SPACES = Spaces(
     {"image": Image(16, 16, 4), "mode": Discrete((4, 4)), "position": Vector(4)}, {"action": Discrete((4,))}
 )

@@ -52,11 +52,11 @@ def with_noise(example: Example) -> tuple[str, tuple[Any, ...]]:
     return "losses", example.problem.loss_arguments
 
 
-def demands_of(example: Example, where: str, bound: float) -> dict[str, Equal]:
-    """What every output must be, by its name."""
+def demands_of(example: Example, where: str, bound: float, reach: float = 1.0) -> dict[str, Equal]:
+    """What every output must be, by its name. reach: size of the returns, to which rounding of their range is
+    relative."""
     total, aux = example.losses
     size, range_ = loss_magnitude(aux), np.array(aux["return_range"])
-    reach = max(1.0, float(np.abs(range_).max()))
     means = {
         name: Equal(mean, (1, group, name), where=where + name, magnitude=size, bound=bound)
         for group in ("losses", "metrics")
