@@ -177,10 +177,16 @@ def part_of(value: Any, path: Path) -> Any:
 
 
 def is_extreme(value: Any) -> bool:
-    """Whether there is a NaN, an infinity, a tiny or a huge number among the real numbers of a nested value."""
+    """Whether a nested value holds what no training step has: a NaN, an infinity, a tiny or a huge number among its
+    real numbers, an empty array, or the flags [B, 1] of sequences that are one step long."""
     if isinstance(value, Mapping | tuple | list):
         return any(is_extreme(value[key]) for key in entries(value))
-    if not isinstance(value, float | np.floating | np.ndarray) or np.asarray(value).dtype.kind != "f":
+    if not isinstance(value, float | np.floating | np.ndarray):
+        return False
+    array = np.asarray(value)
+    if array.size == 0 or (array.dtype.kind == "b" and array.shape[1:] == (1,)):
+        return True
+    if array.dtype.kind != "f":
         return False
     size = np.abs(value)
     return not bool(np.all((size == 0) | ((size >= TINY) & (size <= HUGE))))

@@ -2,7 +2,7 @@
 
 They are small but nothing in them is degenerate: sides, sizes and channel counts differ from each other, every
 parameter is random (the reward and critic outputs too, which start at zero in training), episodes begin, end and are
-cut inside the sequences.
+cut inside the sequences. No image is halved below 3 pixels a side.
 """
 
 import dataclasses
@@ -18,8 +18,8 @@ from spec import Config, Discrete, Image, Spaces, Vector, load_config, parameter
 
 OBSERVATIONS: dict[str, dict[str, Vector | Discrete | Image]] = {
     "vector": {"position": Vector(3), "mode": Discrete((3, 2))},
-    "image": {"image": Image(16, 32, 3)},
-    "both": {"position": Vector(3), "mode": Discrete((3, 2)), "image": Image(16, 32, 3), "depth": Image(16, 32, 1)},
+    "image": {"image": Image(12, 16, 3)},
+    "both": {"position": Vector(3), "mode": Discrete((3, 2)), "image": Image(12, 16, 3), "depth": Image(12, 16, 1)},
 }
 ACTIONS: dict[str, dict[str, Vector | Discrete]] = {
     "discrete": {"action": Discrete((4,))},
@@ -43,10 +43,10 @@ OPTIONS: dict[str, tuple[Any, ...]] = {
     **{f"{name}_scale": (0.3, 2.0) for name in ("representation", "actor", "critic", "replay_critic")},
 }
 OBSERVED: tuple[dict[str, Vector | Discrete | Image], ...] = (
-    {"image": Image(16, 32, 3)},
+    {"image": Image(24, 32, 3)},
     {"mode": Discrete((3, 2)), "position": Vector(3)},
-    {"depth": Image(32, 16, 1), "image": Image(32, 16, 3)},
-    {"board": Discrete((2, 4)), "depth": Image(16, 16, 2), "place": Vector(1), "speed": Vector(2)},
+    {"depth": Image(32, 24, 1), "image": Image(32, 24, 3)},
+    {"board": Discrete((2, 4)), "depth": Image(24, 24, 2), "place": Vector(1), "speed": Vector(2)},
 )
 ACTING: tuple[dict[str, Vector | Discrete], ...] = (
     {"action": Discrete((5,))},
@@ -92,8 +92,12 @@ def spaces(observation: str = "both", action: str = "mixed") -> Spaces:
 
 
 def small_config(profile: str, dtype: str = "float64", **overrides: Any) -> Config:
-    """A configuration of the profile, with sizes that the reference computes in milliseconds."""
-    return load_config(profile, "tiny", compute_dtype=dtype, **{**SMALL, **overrides})
+    """A configuration of the profile, with sizes that the reference computes in milliseconds. Images are halved twice,
+    unless the convolutions are given: implementations refuse maps with sides below 3."""
+    config = load_config(profile, "tiny", compute_dtype=dtype, **{**SMALL, **overrides})
+    if {"cnn_outer", "cnn_multipliers"} & overrides.keys():
+        return config
+    return dataclasses.replace(config, cnn_multipliers=(1, 2, 4) if config.cnn_outer else (2, 4))
 
 
 def random_parameters(

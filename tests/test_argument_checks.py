@@ -60,7 +60,7 @@ MISTAKES: list[tuple[str, tuple[Any, ...], str]] = [
     ("optimizer_step", (*step_with({"a": X}), CONFIG), "gradients: 'a': expected shape [2], got [2, 3]"),
     ("adaptive_gradient_clip", (X, X[0], 0.3, 1e-3), "gradient: expected shape [3], got [2, 3]"),
     ("losses", changed(deter=X), "batch['deter']: expected shape [2, 16], got [2, 3]"),
-    ("losses", changed(image=X), "batch['image']: expected shape [2, 5, 16, 32, 3], got [2, 3]"),
+    ("losses", changed(image=X), "batch['image']: expected shape [2, 5, 12, 16, 3], got [2, 3]"),
     ("losses", changed(reward=None), "batch: missing 'reward'"),
 ]
 

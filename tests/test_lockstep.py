@@ -21,12 +21,12 @@ from conformance.lockstep.bounds import bound
 from conformance.lockstep.drift import GROUPS, Tensor, beyond_one, deviations, of_the_way, share_of_others
 from conformance.lockstep.report import failures, interval_ends, reduce, report
 from conformance.lockstep.run import Lockstep
-from conformance.lockstep.stream import BatchStream, lockstep_config
+from conformance.lockstep.stream import PROBLEMS, BatchStream, lockstep_config
 from conformance.mutants import MUTANTS, Mutant, MutantAdapter
-from conformance.problems import spaces
 from impl_jax import distributions as jax_distributions
 from impl_torch import distributions as torch_distributions
 from reference_numpy.transforms import exponential_bins
+from spec import Spaces
 
 pytestmark = pytest.mark.xdist_group("lockstep")
 STEPS = 20
@@ -289,9 +289,9 @@ def test_a_member_that_writes_into_its_arguments_changes_nobody_elses_step(torch
     assert max(lockstep.comparisons["same"]["one step"].worst["rssm"][1].deviation, 0.0) == 0
 
 
-@pytest.mark.parametrize(("observation", "action"), list(run.PROBLEMS.values()))
-def test_the_stream_holds_all_that_a_batch_can(observation: str, action: str) -> None:
-    task, config = spaces(observation, action), lockstep_config("paper", "float64")
+@pytest.mark.parametrize("task", list(PROBLEMS.values()), ids=list(PROBLEMS))
+def test_the_stream_holds_all_that_a_batch_can(task: Spaces) -> None:
+    config = lockstep_config("paper", "float64")
     one, other = (BatchStream(3, task, config) for _ in range(2))
     batches = [one.batch(8 * number) for number in range(60)]
     again = [other.batch(8 * number) for number in range(60)]
@@ -317,7 +317,7 @@ def test_the_stream_holds_all_that_a_batch_can(observation: str, action: str) ->
 
 
 def test_latents_are_the_context_of_the_next_batch() -> None:
-    task, config = spaces("vector", "discrete"), lockstep_config("paper", "float64")
+    task, config = PROBLEMS["vector"], lockstep_config("paper", "float64")
     stream, rng = BatchStream(0, task, config), np.random.default_rng(0)
     deter, stoch = rng.normal(size=(4, 8, 32)), np.eye(6)[rng.integers(0, 6, (4, 8, 6))]
     stream.store(deter, stoch)

@@ -104,7 +104,7 @@ def test_configurations_and_spaces() -> None:
     got = decode(json.loads(json.dumps(encode_argument(task))))
     assert list(got.observations) == list(task.observations)
     assert got.actions["buttons"].classes == (2, 3)
-    assert got.images["image"].array_shape == (16, 32, 3)
+    assert got.images["image"].array_shape == (12, 16, 3)
     assert (got.action_size, got.action_noise_size) == (7, 4)
 
 

@@ -125,10 +125,10 @@ def the_first_of_equal_pixels_has_the_gradient(setting: Setting) -> Cases:
     The image repeats a 2x2 pattern and the first layer sees only its middle tap, so its output is the same at every
     window, and the gradient of that tap is the pixel that was chosen, times what comes from above.
     """
-    pooled = {"cnn_sampling": "pooled", "cnn_outer": False, "cnn_multipliers": (1, 2, 4)}
+    pooled = {"cnn_sampling": "pooled", "cnn_outer": False, "cnn_multipliers": (2, 4)}
     problem = make_problem(setting.seed, setting.profile, "image", "discrete", setting.dtype, **pooled)
     pattern = np.array([[240, 30], [100, 5]], np.uint8)
-    batch = {**problem.batch, "image": np.tile(pattern[..., None], (*problem.batch["reward"].shape, 8, 16, 3))}
+    batch = {**problem.batch, "image": np.tile(pattern[..., None], (*problem.batch["reward"].shape, 6, 8, 3))}
     kernel = "encoder/image/conv0/kernel"
     middle = np.zeros_like(problem.state["params"][kernel])
     middle[2, 2] = np.abs(problem.state["params"][kernel][2, 2])

@@ -397,12 +397,12 @@ def other_image_stages_match(setting: Setting) -> Cases:
 
 
 def image_stages(setting: Setting, kinds: Iterable[tuple[str, bool]]) -> Cases:
-    task, rng, dtype = Spaces({"image": Image(8, 4, 2)}, {"action": Vector(1)}), setting.rng(), setting.dtype
+    task, rng, dtype = Spaces({"image": Image(16, 12, 2)}, {"action": Vector(1)}), setting.rng(), setting.dtype
     for sampling, outer in kinds:
         choices = {"cnn_sampling": sampling, "cnn_outer": outer, "cnn_multipliers": (1, 4), "blocks": 4}
         config = small_config(setting.profile, dtype, **choices)
         params = {name: setting.cast(value) for name, value in random_parameters(rng, config, task, dtype).items()}
-        image = rng.integers(0, 256, (2, 8, 4, 2)).astype(np.uint8)
+        image = rng.integers(0, 256, (2, 16, 12, 2)).astype(np.uint8)
         x = image / 255 - 0.5
         for index in range(2):
             kernel, bias, scale = (params[f"encoder/image/conv{index}/{part}"] for part in ("kernel", "bias", "scale"))

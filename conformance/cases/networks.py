@@ -19,7 +19,7 @@ from spec import Config, Discrete, Image, Spaces, Vector, parameter_table
 # A capital letter sorts before all small ones. The mapping of observations is given in another order than the sorted
 # one.
 VECTORS: dict[str, Vector | Discrete] = {"position": Vector(3), "mode": Discrete((3, 2)), "Speed": Vector(2)}
-IMAGES: dict[str, Image] = {"image": Image(8, 12, 3), "depth": Image(8, 12, 1)}
+IMAGES: dict[str, Image] = {"image": Image(12, 16, 3), "depth": Image(12, 16, 1)}
 ACTIONS: dict[str, Vector | Discrete] = {"turn": Vector(2), "buttons": Discrete((2, 3)), "Arm": Vector(1)}
 TASK = Spaces({**VECTORS, **IMAGES}, ACTIONS)
 VECTOR_TASK = Spaces(VECTORS, ACTIONS)
@@ -161,7 +161,7 @@ def non_finite_vectors_show(setting: Setting) -> Cases:
 def brightness_literals(setting: Setting) -> Cases:
     """Brightness 0, 1, 127, 128 and 255 enters as -0.5, -0.4961, -0.00196, 0.00196 and 0.5, also in a picture that
     holds nothing else."""
-    task = Spaces({"image": Image(4, 4, 1)}, ACTIONS)
+    task = Spaces({"image": Image(12, 12, 1)}, ACTIONS)
     config = config_of(setting, 1, cnn_multipliers=(2, 2), cnn_depth=1, norm_epsilon=0.0)
     params = zero_parameters(config, task) | {"encoder/image/conv0/bias": np.array([0.0, 1.0])}
     params["encoder/image/conv0/kernel"][1, 1, 0, 0] = 1  # the top left pixel of four, beside a constant channel
@@ -169,8 +169,9 @@ def brightness_literals(setting: Setting) -> Cases:
     entering = {0: -0.5, 1: -0.49607843137, 127: -0.00196078431, 128: 0.00196078431, 255: 0.5}
     # A picture without any number above 1 is scaled like all others.
     for brightness in ([0, 1, 127, 128, 255], [1, 0, 1, 1, 0]):
-        image = np.broadcast_to(np.array(brightness, np.uint8)[:, None, None, None], (5, 4, 4, 1)).copy()
-        expected = np.array([activated(*activated(entering[number], 1)) for number in brightness])
+        image = np.broadcast_to(np.array(brightness, np.uint8)[:, None, None, None], (5, 12, 12, 1)).copy()
+        pixels = np.array([activated(*activated(entering[number], 1)) for number in brightness])
+        expected = np.tile(pixels, 9)  # all of 3 x 3 are equal
         bound = 1e-9 if setting.u < 1e-10 else None
         yield equal("encoder", (params, {"image": image}, task, config), expected, magnitude="tensor", bound=bound)
 
@@ -178,14 +179,14 @@ def brightness_literals(setting: Setting) -> Cases:
 @check("NET-8", "NET-9", uses=["encoder"], level=1)
 def pooling_comes_before_normalization(setting: Setting) -> Cases:
     """Convolution outputs (3, 0), (0, 4), (0, 0), (0, 0) are pooled to (3, 4) and then become (0.594189, 0.855420)."""
-    task = Spaces({"image": Image(4, 4, 2)}, ACTIONS)
+    task = Spaces({"image": Image(12, 12, 2)}, ACTIONS)
     config = config_of(setting, 3, cnn_multipliers=(2, 2), cnn_depth=1, norm_epsilon=0.0)
     params = zero_parameters(config, task) | {"encoder/image/conv0/bias": np.array([1.5, 2.0])}
     params["encoder/image/conv0/kernel"][2, 2] = np.diag([3.0, 4.0])
     params["encoder/image/conv1/kernel"][2, 2] = np.eye(2)
-    image = np.zeros((1, 4, 4, 2), np.uint8)
+    image = np.zeros((1, 12, 12, 2), np.uint8)
     image[:, 0::2, 0::2, 0] = image[:, 0::2, 1::2, 1] = 255
-    expected = activated(*activated(3, 4))[None]
+    expected = np.tile(activated(*activated(3, 4)), 9)[None]  # all of 3 x 3 are equal
     yield equal("encoder", (params, {"image": image}, task, config), expected, magnitude="tensor")
 
 
@@ -193,7 +194,7 @@ def pooling_comes_before_normalization(setting: Setting) -> Cases:
 def brightness_is_scaled_in_float32(setting: Setting) -> Cases:
     """The two greys nearest to 0 differ by 1/255 whatever the compute dtype: bfloat16 would halve or double one of
     them."""
-    task = Spaces({"image": Image(8, 8, 1)}, ACTIONS)
+    task = Spaces({"image": Image(12, 12, 1)}, ACTIONS)
     config = config_of(setting, norm_epsilon=1e-12)
     params = params_of(setting, config, task)
     params |= {
@@ -201,7 +202,7 @@ def brightness_is_scaled_in_float32(setting: Setting) -> Cases:
         for name, value in params.items()
         if name.startswith("encoder/image/") and name.endswith("bias")
     }
-    observations = {"image": setting.rng().integers(127, 129, (ROWS, 8, 8, 1)).astype(np.uint8)}
+    observations = {"image": setting.rng().integers(127, 129, (ROWS, 12, 12, 1)).astype(np.uint8)}
     expected = reference.encoder(params, observations, task, config)
     # x / 255 - 1/2 loses the digits that cancel.
     bound = {"float64": 1e-11, "float32": 1e-3, "bfloat16": 0.125}[setting.dtype]
@@ -255,7 +256,7 @@ def decoder_literals(setting: Setting) -> Cases:
             for key in ("position", "Speed", "mode")
         ),
         *(
-            Equal(np.broadcast_to(values, (ROWS, 8, 12, len(values))), at=(key,), where=key, bound=64 * setting.u)
+            Equal(np.broadcast_to(values, (ROWS, 12, 16, len(values))), at=(key,), where=key, bound=64 * setting.u)
             for key, values in sigmoids.items()
         ),
     )
@@ -263,19 +264,21 @@ def decoder_literals(setting: Setting) -> Cases:
 
 @check("NET-16", "NET-17", "NET-19", uses=["decoder"], level=1)
 def stem_literals(setting: Setting) -> Cases:
-    """2 blocks, a 1 x 2 map of 4 channels: outputs 0 1 4 5 and 2 3 6 7 of the memory, 0 1 2 3 and 4 5 6 7 of the
-    latents share a pixel."""
-    task = Spaces({"wide": Image(4, 8, 3), "thin": Image(4, 8, 1)}, ACTIONS)
+    """2 blocks, a 3 x 4 map of 4 channels: outputs 0 1 24 25 and 2 3 26 27 of the memory, 0 1 2 3 and 4 5 6 7 of the
+    latents share a pixel, and so on row by row."""
+    task = Spaces({"wide": Image(12, 16, 3), "thin": Image(12, 16, 1)}, ACTIONS)
     config = config_of(setting, 1, cnn_multipliers=(4, 4), cnn_depth=1, norm_epsilon=1e-20)
     params = zero_parameters(config, task)
-    # Pixel i becomes pixel 2i.
+    # Pixel i becomes pixel 4i in both directions.
     params["decoder/image/conv0/kernel"][1, 1] = params["decoder/image/out/kernel"][1, 1] = np.eye(4)
-    numbers = np.arange(8.0)
-    cases = {"deter": ([0, 1, 4, 5], [2, 3, 6, 7]), "stoch": ([0, 1, 2, 3], [4, 5, 6, 7])}
-    for name, pixels in cases.items():
-        expected = np.full((1, 4, 8, 4), 0.5)
-        for column, values in zip((0, 4), pixels, strict=True):
-            expected[0, 0, column] = 1 / (1 + np.exp(-activated(*activated(*values))))
+    numbers = np.arange(48.0)
+    # Of each pixel the first channel, and what the other three are more than that.
+    layouts = {"deter": (2, (0, 1, 24, 25)), "stoch": (4, (0, 1, 2, 3))}
+    for name, (step, channels) in layouts.items():
+        expected = np.full((1, 12, 16, 4), 0.5)
+        for pixel in range(12):
+            values = activated(*activated(*(step * pixel + channel for channel in channels)))
+            expected[0, 4 * (pixel // 4), 4 * (pixel % 4)] = 1 / (1 + np.exp(-values))
         arguments = params | {f"decoder/image/{name}/bias": numbers}, features_of(setting, config, 1), task, config
         yield equal("decoder", arguments, {"thin": expected[..., :1], "wide": expected[..., 1:]}, magnitude="tensor")
 

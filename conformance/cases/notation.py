@@ -39,8 +39,8 @@ LOSS_NUMBERS: dict[str, Any] = {
     "norm_epsilon": 0.05, "bins": 21, "latent_unimix": 0.07, "actor_unimix": 0.05, "actor_min_std": 0.3,
     "actor_max_std": 0.8, "encoder_layers": 2, "decoder_layers": 2, "posterior_layers": 2, "prior_layers": 1,
     "reward_layers": 2, "continue_layers": 2, "actor_layers": 2, "critic_layers": 2, "blocks": 4,
-    "cnn_multipliers": (2, 3, 4), "reconstruction_scale": 0.9, "reward_scale": 1.3, "continue_scale": 0.7,
-    "dynamics_scale": 0.6, "representation_scale": 0.35, "free_nats": 1.5, "vector_loss_scale": 0.77,
+    "reconstruction_scale": 0.9, "reward_scale": 1.3, "continue_scale": 0.7, "dynamics_scale": 0.6,
+    "representation_scale": 0.35, "free_nats": 1.5, "vector_loss_scale": 0.77,
     "imagination_horizon": 4, "discount_horizon": 20.0, "return_lambda": 0.8, "actor_scale": 1.2,
     "critic_scale": 0.8, "replay_critic_scale": 0.45, "slow_critic_scale": 0.65, "entropy_scale": 0.05,
     "return_percentile_low": 20.0, "return_percentile_high": 70.0, "return_decay": 0.5, "return_limit": 1e4,
@@ -185,6 +185,7 @@ def odd_problem(setting: Setting, observation: str, action: str) -> Problem:
         "start_continue": "predicted" if plain.start_continue == "true" else "true",
         "cnn_sampling": "pooled" if plain.cnn_sampling == "strided" else "strided",
         "cnn_outer": not plain.cnn_outer,
+        "cnn_multipliers": (3, 4) if plain.cnn_outer else (2, 3, 4),
     }
     sizes = {"units": 12, "deter": 24, "stoch": 4, "classes": 3, "cnn_depth": 1, "batch_size": 3, "batch_length": 4}
     numbers = {**LOSS_NUMBERS, **OPTIMIZER_NUMBERS, **choices, **sizes}

@@ -437,8 +437,8 @@ def open_loop_literals(setting: Setting) -> Cases:
     expected = {
         "position": [math.e - 1, 1 - math.e**2, 0],
         "mode": [1 / (2 + odds), odds / (2 + odds), 1 / (2 + odds), high, low],
-        "depth": np.full((16, 32, 1), 0.5),
-        "image": np.broadcast_to([0.5, high, low], (16, 32, 3)),
+        "depth": np.full((12, 16, 1), 0.5),
+        "image": np.broadcast_to([0.5, high, low], (12, 16, 3)),
         "reward": high * exponential_bins(config.bins)[16],
         "continue_": high,
     }

@@ -17,7 +17,8 @@ from conformance.lockstep.bounds import bound
 from conformance.lockstep.drift import GROUPS
 from conformance.lockstep.plot import draw, figure_class
 from conformance.lockstep.report import failures, report
-from conformance.lockstep.run import MODES, PROBLEMS, Comparison, Lockstep
+from conformance.lockstep.run import MODES, Comparison, Lockstep
+from conformance.lockstep.stream import PROBLEMS
 from conformance.results import versions, write
 from spec import built_profiles
 

@@ -13,13 +13,11 @@ from conformance.compare import round_to
 from conformance.errors import UserError
 from conformance.lockstep.bounds import bound
 from conformance.lockstep.drift import GROUPS, Nested, Tensor, deviations
-from conformance.lockstep.stream import Arrays, BatchStream, lockstep_config
+from conformance.lockstep.stream import PROBLEMS, Arrays, BatchStream, lockstep_config
 from conformance.mutants import planted
-from conformance.problems import spaces
 from reference_numpy import agent, distributions
 from spec import parameter_table
 
-PROBLEMS = {"vector": ("vector", "discrete"), "image": ("image", "continuous")}
 MODES = ("free", "one step")
 # How near a uniform number may come to a threshold of its sample. Far above what the states in lockstep differ by; in
 # bfloat16 a thousand samples cannot all keep away from where rounding moves the thresholds.
@@ -77,7 +75,7 @@ class Lockstep:
         if len(members) < 2:
             raise UserError(f"lockstep compares at least two different backends, got {', '.join(members) or 'none'}")
         self.dtype = dtype
-        self.task, self.config = spaces(*PROBLEMS[problem]), lockstep_config(profile, dtype)
+        self.task, self.config = PROBLEMS[problem], lockstep_config(profile, dtype)
         self.members = dict(members)
         self.supplier = next(
             (adapter for adapter in members.values() if callable(getattr(adapter, "gradients", None))), None

@@ -12,13 +12,17 @@ from typing import Any
 import numpy as np
 
 from conformance.problems import action_noise, uniforms
-from spec import Config, Discrete, Spaces, load_config
+from spec import Config, Discrete, Image, Spaces, Vector, load_config
 
 BROKEN = 1.0  # radians a step
 BONUS_ANGLE = 0.3  # radians
 TIME_LIMIT = (12, 40)  # steps
 SKILL_STEPS = 400  # train steps until the pushes are as good as they get
 SKILL = 0.6
+PROBLEMS = {
+    "vector": Spaces({"position": Vector(3), "mode": Discrete((3, 2))}, {"action": Discrete((4,))}),
+    "image": Spaces({"image": Image(16, 32, 3)}, {"action": Vector(3)}),
+}
 # All else is the profile's, the optimizer and its warmup as well.
 SIZES: dict[str, Any] = {
     "units": 16,
