@@ -352,6 +352,20 @@ class Adapter(Protocol):
     ) -> tuple[Nested, Nested]:
         """`train_step` with given samples in place of the noise: see `losses_given`."""
 
+    def vjp(self, function: str, arguments: tuple[Any, ...], cotangents: Any) -> Sequence[Any]:
+        """What flows back into the arguments of a function of this interface. Where `convert` makes tensors of PyTorch
+        or JAX, the kit finds it by itself.
+
+        Args:
+          function: its name.
+          arguments: as it takes them.
+          cotangents: an array of the shape of its result; name -> array where it has several.
+
+        Returns:
+          The arguments, with the gradient of the sum of results times cotangents in place of each array of real
+          numbers, and 0 in place of all else.
+        """
+
     # The object that is trained, with its own noise and caches.
     def Learner(self, spaces: Spaces, config: Config, seed: int) -> "Learner":  # noqa: N802
         """An agent and its optimizer in training: what runs for days.

@@ -15,7 +15,7 @@ from conformance.errors import UserError
 from conformance.foreign import ForeignAdapter, as_edition
 from conformance.own_names import ours, ours_in
 from conformance.process import ProcessAdapter
-from conformance.serve import convert_arrays, load_file, missing_field, to_numpy
+from conformance.serve import convert_arrays, function_of, load_file, missing_field, to_numpy
 
 WAY_OUT = (
     "rename yours, or run the adapter in a process where ours is not: "
@@ -32,10 +32,11 @@ class ModuleAdapter(ForeignAdapter):
         getattr(module, "setup", lambda dtype: None)(dtype)
 
     def offers(self, name: str) -> bool:
-        return callable(getattr(self._module, name, None))
+        names = (name, "convert") if name == "vjp" else (name,)
+        return any(callable(getattr(self._module, found, None)) for found in names)
 
     def call(self, name: str, arguments: tuple[Any, ...]) -> Any:
-        function = getattr(self._module, name)
+        function = function_of(self._module, name)
         _require_arguments(name, function)
         convert = getattr(self._module, "convert", None)
         try:

@@ -68,7 +68,7 @@ class ForeignAdapter(abc.ABC):
                 np.asarray(value) if is_array and np.isscalar(value) else value for value, is_array in kinds
             )
             result = self.call(name, arguments)
-            return result if name in OBJECTS else arranged(name, arguments, result)
+            return result if name in (*OBJECTS, "vjp") else arranged(name, arguments, result)
 
         return function
 

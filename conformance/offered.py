@@ -4,7 +4,11 @@ from collections.abc import Collection, Iterable
 from typing import Any
 
 from conformance.adapter import INTERFACE
+from conformance.check import CHECKS
 from conformance.execute import Result
+
+GRADIENTS_OF_ALL = ("gradients", "gradients_given", "loss_derivatives")
+"""With one of these the gradient of every loss is judged."""
 
 
 def offered(adapter: object) -> list[str]:
@@ -27,3 +31,14 @@ def unchecked(functions: Collection[str], results: Iterable[Result]) -> list[dic
         if lacking and all(lacking):
             found.append({"function": name, "needs": min(lacking, key=len)})
     return found
+
+
+def without_gradients(results: Iterable[Result]) -> list[str]:
+    """Functions whose values were judged and whose gradients were not, because nothing that is offered shows them."""
+    judged = [result.check for result in results if result.status != "not offered"]
+    if any(not set(check.uses).isdisjoint(GRADIENTS_OF_ALL) for check in judged):
+        return []
+    shown = {name for check in judged if "vjp" in check.uses for name in check.uses}
+    valued = {name for check in judged for name in check.uses}
+    have_gradients = dict.fromkeys(name for check in CHECKS.values() if "vjp" in check.uses for name in check.uses)
+    return [name for name in have_gradients if name in valued - shown]

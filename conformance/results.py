@@ -16,7 +16,7 @@ from conformance.errors import UserError, read_text
 from conformance.execute import FAILING, CheckOptions, RequirementResult, Result, by_requirement
 from conformance.expected import ExpectedFailures
 from conformance.foreign import ForeignAdapter
-from conformance.offered import offered, unchecked
+from conformance.offered import offered, unchecked, without_gradients
 from conformance.reports.reproduce import failure
 from conformance.requirements import chapter_of, requirements
 from conformance.schema import misfit, validator
@@ -80,6 +80,7 @@ def result_data(
         "fit": fit,
         "implementation": dict(implementation),
         "unchecked": unchecked(implementation["offered"], results),
+        "without_gradients": without_gradients(results),
         "versions": versions(),
         "verdict": verdict(options, results, expected),
         "expected_failures": [

@@ -166,6 +166,7 @@ def _result(adapter: Any, request: Mapping[str, Any]) -> Any:
             raise BadMessage(f"this server speaks protocol {PROTOCOL}, not {request.get('protocol')!r}")
         getattr(adapter, "setup", lambda dtype: None)(request["dtype"])
         names = [name for name in dir(adapter) if not name.startswith("_") and callable(getattr(adapter, name))]
+        names += ["vjp"] if "convert" in names and "vjp" not in names else []
         return {
             "protocol": PROTOCOL,
             "name": adapter.__name__,
@@ -177,7 +178,7 @@ def _result(adapter: Any, request: Mapping[str, Any]) -> Any:
     if method == "run":
         convert = getattr(adapter, "convert", None)
         arguments = [convert_arrays(decode(argument), convert) for argument in request["args"]]
-        return encode(to_numpy(getattr(adapter, request["function"])(*arguments)))
+        return encode(to_numpy(function_of(adapter, request["function"])(*arguments)))
     if method == "stop":
         return None
     raise BadMessage(f"unknown method {method!r}")
@@ -194,6 +195,95 @@ def convert_arrays(value: Any, convert: Any) -> Any:
     if isinstance(value, (tuple, list)):
         return tuple(convert_arrays(entry, convert) for entry in value)
     return value
+
+
+def function_of(adapter: Any, name: str) -> Any:
+    """A function of the adapter; `vjp` of an adapter that has none is made from its tensors."""
+    if name == "vjp" and not hasattr(adapter, "vjp"):
+        return lambda function, arguments, cotangents: vjp(getattr(adapter, function), arguments, cotangents)
+    return getattr(adapter, name)
+
+
+def vjp(function: Any, arguments: tuple[Any, ...], cotangents: Any) -> tuple[Any, ...]:
+    """What flows back into the arguments of a function that computes with tensors of PyTorch or JAX.
+
+    Args:
+      function: of the adapter.
+      arguments: with tensors; those of real numbers are followed.
+      cotangents: a tensor of the shape of the result, or name -> tensor for several results.
+
+    Returns:
+      The arguments, with the gradient of the sum of results times cotangents in place of each tensor that was followed,
+      and 0 in place of all else.
+
+    Raises:
+      NotImplementedError: no gradient can be seen: other arrays, or results that do not hang together with them.
+    """
+    leaves: list[Any] = []
+    replaced(arguments, leaves.append)
+    library = {type(leaf).__module__.partition(".")[0] for leaf in leaves}
+    if "torch" in library:
+        gradients = _torch_vjp(function, arguments, leaves, cotangents)
+    elif library & {"jax", "jaxlib"}:
+        gradients = _jax_vjp(function, arguments, leaves, cotangents)
+    else:
+        raise NotImplementedError("gradients: `convert` makes tensors of neither PyTorch nor JAX")
+    found = iter(gradients)
+    return tuple(replaced(argument, lambda _: next(found), lambda _: 0) for argument in arguments)
+
+
+def replaced(value: Any, tensor: Any, other: Any = lambda value: value) -> Any:
+    """The value with `tensor` applied to every array or tensor of real numbers in it, and `other` to all else."""
+    if isinstance(value, Mapping):
+        return {key: replaced(entry, tensor, other) for key, entry in value.items()}
+    if isinstance(value, (tuple, list)):
+        return tuple(replaced(entry, tensor, other) for entry in value)
+    is_real = "float" in str(getattr(value, "dtype", "")) and hasattr(value, "shape")
+    return tensor(value) if is_real else other(value)
+
+
+def _weighted(result: Any, cotangents: Any) -> Any:
+    """The sum of all results times their cotangents, which have their names or their order."""
+    if not isinstance(cotangents, Mapping):
+        if "float" not in str(getattr(result, "dtype", "")):
+            raise NotImplementedError("gradients: its results are not real numbers of a tensor")
+        return (result * cotangents).sum()
+    if callable(getattr(result, "items", None)):
+        result = dict(result.items())
+        result = [result[name] for name in cotangents]
+    elif not isinstance(result, (tuple, list)) or hasattr(result, "_asdict"):
+        result = [getattr(result, name) for name in cotangents]
+    return sum(_weighted(part, weight) for part, weight in zip(result, cotangents.values()))  # noqa: B905 - Python 3.8
+
+
+def _torch_vjp(function: Any, arguments: Any, leaves: list[Any], cotangents: Any) -> list[Any]:
+    torch = sys.modules["torch"]
+    leaves = [leaf.detach().requires_grad_() for leaf in leaves]
+    given = iter(leaves)
+    try:
+        total = _weighted(function(*replaced(arguments, lambda _: next(given).clone())), cotangents)
+    except RuntimeError as error:
+        if "requires grad" not in str(error):
+            raise
+        raise NotImplementedError(f"gradients: its tensors leave PyTorch: {error}") from error
+    if not getattr(total, "requires_grad", False):
+        raise NotImplementedError("gradients: its results have none")
+    found = torch.autograd.grad(total, leaves, allow_unused=True)
+    return [torch.zeros_like(leaf) if gradient is None else gradient for leaf, gradient in zip(leaves, found)]  # noqa: B905
+
+
+def _jax_vjp(function: Any, arguments: Any, leaves: list[Any], cotangents: Any) -> list[Any]:
+    jax = sys.modules["jax"]
+
+    def total(leaves: list[Any]) -> Any:
+        given = iter(leaves)
+        return _weighted(function(*replaced(arguments, lambda _: next(given))), cotangents)
+
+    try:
+        return list(jax.grad(total)(leaves))
+    except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:
+        reason = str(error).partition("\n")[0]
+        raise NotImplementedError(f"gradients: JAX cannot trace it: {reason}") from error
 
 
 def serve(adapter: Any, requests: BinaryIO, replies: BinaryIO) -> None:

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from conformance.serve import vjp
 from impl_jax import agent, behavior, distributions, layers, networks, optimizer, returns, rssm, transforms, world_model
 from impl_jax.learner import Learner, select_device
 from spec import Config, Spaces
@@ -42,16 +43,15 @@ class JaxAdapter:
         self.quick = False
 
     def __getattr__(self, name: str) -> Any:
-        for chapter in CHAPTERS:
-            function = vars(chapter).get(name)
-            if (
-                function is not None
-                and not name.startswith("_")
-                and getattr(function, "__module__", None) == chapter.__name__
-            ):
-                first = jnp.bfloat16 if self.dtype == "bfloat16" and chapter is layers and name not in EXACT else None
-                return functools.partial(self._run, function, name, first)
-        raise AttributeError(name)
+        function = _function(name)
+        narrow = self.dtype == "bfloat16" and function.__module__ == layers.__name__ and name not in EXACT
+        return functools.partial(self._run, function, name, jnp.bfloat16 if narrow else None)
+
+    def vjp(self, function: str, arguments: tuple[Any, ...], cotangents: Any) -> Any:
+        def pull(cotangents: Any, *arguments: Any) -> Any:
+            return vjp(_function(function), arguments, cotangents)
+
+        return self._run(pull, ("vjp", function), None, cotangents, *arguments)
 
     def compile_calls(self, calls: Iterable[tuple[str, tuple[Any, ...]]]) -> None:
         """Compiles what these calls need, several at a time, and everything without the optimizations that take longer
@@ -181,6 +181,15 @@ class JaxAdapter:
         elif array.dtype.kind == "i":
             array = array.astype(np.int32)
         return jax.device_put(array, self.device)  # jnp.asarray would compile for each shape
+
+
+def _function(name: str) -> Callable[..., Any]:
+    """A public function of impl_jax."""
+    for chapter in CHAPTERS:
+        function: Any = vars(chapter).get(name)
+        if not name.startswith("_") and getattr(function, "__module__", None) == chapter.__name__:
+            return function
+    raise AttributeError(name)
 
 
 def accepted(options: Mapping[str, Any]) -> dict[str, Any]:

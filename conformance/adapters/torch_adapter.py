@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from conformance.serve import vjp
 from impl_torch import (
     agent,
     behavior,
@@ -42,11 +43,12 @@ class TorchAdapter:
             torch.backends.cudnn.allow_tf32 = False
 
     def __getattr__(self, name: str) -> Any:
-        for chapter in CHAPTERS:
-            function: Any = vars(chapter).get(name)
-            if not name.startswith("_") and getattr(function, "__module__", None) == chapter.__name__:
-                return self._wrap(function, narrow=chapter in NARROW and name != "truncated_normal")
-        raise AttributeError(name)
+        function, narrow = _function(name)
+        return self._wrap(function, narrow)
+
+    def vjp(self, function: str, arguments: tuple[Any, ...], cotangents: Any) -> Any:
+        with_tensors = self._with_tensors(*_function(function))
+        return _leave(vjp(with_tensors, self._enter(arguments), self._enter(cotangents)))
 
     def Learner(self, spaces: Spaces, config: Config, seed: int) -> Learner:  # noqa: N802
         return Learner(spaces, self._enter(config), seed=seed, device=self._device.type)
@@ -76,6 +78,11 @@ class TorchAdapter:
         return derivatives
 
     def _wrap(self, function: Callable[..., Any], narrow: bool = False) -> Callable[..., Any]:
+        with_tensors = self._with_tensors(function, narrow)
+        return lambda *arguments: _leave(with_tensors(*arguments))
+
+    def _with_tensors(self, function: Callable[..., Any], narrow: bool) -> Callable[..., Any]:
+        """The function with arrays or tensors in and tensors out."""
         wanted = [parameter.annotation for parameter in inspect.signature(function).parameters.values()]
 
         def call(*arguments: Any) -> Any:
@@ -89,7 +96,7 @@ class TorchAdapter:
                 converted[0] = converted[0].to(DTYPES[self._dtype])
             if function in (layers.dense, layers.mlp):
                 converted[2] = converted[2].to(DTYPES[self._dtype])
-            return _leave(function(*converted))
+            return function(*converted)
 
         return call
 
@@ -104,6 +111,15 @@ class TorchAdapter:
             tensor = torch.tensor(x, device=self._device)
             return tensor.to(self._wide) if tensor.is_floating_point() else tensor
         return x
+
+
+def _function(name: str) -> tuple[Callable[..., Any], bool]:
+    """A public function of impl_torch, and whether its first argument has the compute dtype."""
+    for chapter in CHAPTERS:
+        function: Any = vars(chapter).get(name)
+        if not name.startswith("_") and getattr(function, "__module__", None) == chapter.__name__:
+            return function, chapter in NARROW and name != "truncated_normal"
+    raise AttributeError(name)
 
 
 def _with_pair(arguments: tuple[Any, ...]) -> tuple[Any, ...]:

@@ -227,7 +227,13 @@ def unchecked(data: Data) -> list[str]:
 
 def notes(data: Data) -> list[str]:
     """What is to be known of a run beside its outcome: sentences."""
-    return [*edition(data), *unchecked(data), *undiagnosed(data)]
+    return [*edition(data), *unchecked(data), *without_gradients(data), *undiagnosed(data)]
+
+
+def without_gradients(data: Data) -> list[str]:
+    """A line, if any: the functions of which values alone were judged."""
+    names = data["without_gradients"]
+    return [f"Gradients were not looked at: {', '.join(names)}."] if names else []
 
 
 def undiagnosed(data: Data) -> list[str]:
