@@ -122,6 +122,12 @@ class Case:
     keeps: bool = False
 
     @property
+    def functions(self) -> frozenset[str]:
+        """What it asks, the function whose gradient it asks for included."""
+        pulled = {str(call.arguments[0]) for call in self.calls if call.function == "vjp"}
+        return frozenset(call.function for call in self.calls) | pulled
+
+    @property
     def is_extreme(self) -> bool:
         """Whether it is about input that is refused, not finite, tiny or huge."""
         return self.refused is not None or any(is_extreme(call.arguments) for call in self.calls)

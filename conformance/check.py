@@ -2,7 +2,7 @@
 
 Most checks build cases (conformance/case.py). A check that hands a candidate's result to another call, or that drives
 an object, is a script (conformance/script.py). Where an adapter does not offer a function that a check uses, the check
-is reported as not offered.
+is not asked there; of cases those are judged that ask others alone (conformance/offered.py).
 """
 
 import dataclasses
@@ -19,7 +19,8 @@ from conformance.script import Script
 class Check:
     """One registered check.
 
-    cases: builds its cases, None for a script. script: judges a candidate itself, None where there are cases.
+    cases: builds its cases, None for a script. script: judges a candidate itself, None where there are cases. lacking:
+    functions that an adapter does not offer, and whose cases have been left out for it.
     """
 
     name: str
@@ -30,6 +31,7 @@ class Check:
     summary: str
     cases: Callable[[Setting], Cases] | None = None
     script: Callable[[Script], None] | None = None
+    lacking: tuple[str, ...] = ()
 
     @property
     def is_large(self) -> bool:

@@ -25,6 +25,7 @@ from conformance.execute import FAILING, CheckOptions, Result, missing, not_offe
 from conformance.judge import Ask, asking, copied, judge_refusal, standing_in
 from conformance.mutants import MUTANTS, Mutant, MutantAdapter
 from conformance.mutants.trial import on_the_mutant, on_the_reference
+from conformance.offered import narrowed
 from spec import Edition, editions
 
 NOT_JUDGED = "not in edition"
@@ -85,6 +86,7 @@ def judge(
     ordinary: deviations with extreme input do not count.
     """
     setting = Setting(dtype, edition.profile, seed, examples)
+    check = narrowed(check, adapter, setting)
     if lacking := missing(adapter, check):
         return not_offered(check, lacking)
     if reason := _unknown(check, edition.name, setting):
@@ -101,7 +103,7 @@ def judge_twice(
     result = judge(check, adapter, edition, dtype, seed, examples)
     if result.status not in FAILING:
         return result
-    if _asks_nothing_ordinary(check, Setting(dtype, edition.profile, seed, AGAIN * examples)):
+    if _asks_nothing_ordinary(result.check, Setting(dtype, edition.profile, seed, AGAIN * examples)):
         return dataclasses.replace(result, extreme=True)
     again = judge(check, adapter, edition, dtype, seed, AGAIN * examples, shrink=False, ordinary=True)
     return dataclasses.replace(result, extreme=again.status == "pass")
@@ -237,7 +239,8 @@ def fit(checks: Iterable[Check], adapter: object, dtype: str, seed: int = 0, exa
     come back.
     """
     found: dict[str, dict[str, str]] = {name: {} for name in PREFERRED}
-    for check in checks:
+    first = Setting(dtype, editions()[PREFERRED[0]].profile, seed, examples)
+    for check in (narrowed(check, adapter, first) for check in checks):
         if missing(adapter, check):
             continue
         broken = False

@@ -88,6 +88,7 @@ class RequirementResult:
     @property
     def status(self) -> str:
         statuses = {result.status for result in self.results}
+        statuses |= {"not offered" for result in self.results if result.check.lacking}
         for status in ("error", "fail", "not offered"):
             if status in statuses:
                 return status

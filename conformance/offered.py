@@ -1,11 +1,15 @@
-"""What an adapter offers, and which of it no check could use."""
+"""What an adapter offers, what the checks can ask of it, and which of it no check could use."""
 
-from collections.abc import Collection, Iterable
+import dataclasses
+import functools
+from collections.abc import Callable, Collection, Iterable, Iterator
 from typing import Any
 
 from conformance.adapter import INTERFACE
-from conformance.check import CHECKS
-from conformance.execute import Result
+from conformance.case import Case, Cases, Drawn, Setting
+from conformance.check import CHECKS, Check
+from conformance.drawing import cases
+from conformance.execute import Result, missing
 
 GRADIENTS_OF_ALL = ("gradients", "gradients_given", "loss_derivatives")
 """With one of these the gradient of every loss is judged."""
@@ -14,6 +18,33 @@ GRADIENTS_OF_ALL = ("gradients", "gradients_given", "loss_derivatives")
 def offered(adapter: object) -> list[str]:
     """The functions of the interface that an adapter has, in its order."""
     return [name for name in INTERFACE if callable(getattr(adapter, name, None))]
+
+
+def narrowed(check: Check, adapter: object, setting: Setting) -> Check:
+    """The check with the cases that ask only what the adapter offers: whoever has `prior` need not have `posterior`.
+
+    It is the check itself where all is offered, and where nothing would be left.
+    """
+    lacking = frozenset(missing(adapter, check))
+    if not lacking or check.cases is None or lacking.issuperset(check.uses):
+        return check
+    build = _without(check.cases, lacking)
+    if not cases(build, setting):
+        return check
+    uses = tuple(name for name in check.uses if name not in lacking)
+    return dataclasses.replace(check, cases=build, uses=uses, lacking=tuple(sorted(lacking)))
+
+
+@functools.cache  # so that what is cached by function is found again
+def _without(build: Callable[[Setting], Cases], lacking: frozenset[str]) -> Callable[[Setting], Cases]:
+    def kept(build: Callable[..., Cases], *arguments: Any, **drawn: Any) -> Iterator[Case | Drawn]:
+        for item in build(*arguments, **drawn):
+            if isinstance(item, Drawn):
+                yield Drawn(functools.partial(kept, item.build), **item.strategies)
+            elif item.functions.isdisjoint(lacking):
+                yield item
+
+    return functools.partial(kept, build)
 
 
 def unchecked(functions: Collection[str], results: Iterable[Result]) -> list[dict[str, Any]]:

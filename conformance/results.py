@@ -120,6 +120,7 @@ def check_data(result: Result, options: CheckOptions, expected: ExpectedFailures
     return {
         "status": result.status,
         "requirements": list(check.requirements),
+        "lacking": list(check.lacking),
         "level": check.level,
         "summary": check.summary,
         "compared": result.compared,

@@ -283,7 +283,8 @@ def test_expected_failures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert run(tmp_path, ADAPTER, "--only", PASS, *expect) == 0
     assert "was not run" in capsys.readouterr().out
 
-    file.write_text('RET-1 = "as the paper prints it"\n"layers.rms_norm_literals" = "later"\n', encoding="utf-8")
+    text = 'RET-1 = "as the paper prints it"\nRET-17 = "the same"\n"layers.rms_norm_literals" = "later"\n'
+    file.write_text(text, encoding="utf-8")
     assert run(tmp_path, ADAPTER, "--only", "RET-1", *expect, "--at-least", "0") == 0
     assert run(tmp_path, ADAPTER, "--only", ERROR, *expect, "--at-least", "0") == 0
 

@@ -8,8 +8,10 @@ from typing import Any
 import pytest
 
 from conformance.candidate import candidate
+from conformance.case import Setting
 from conformance.editions import judge
 from conformance.execute import Result, missing, selected_checks
+from conformance.offered import narrowed
 from docs.third_party import FAILING, KINDS, failing, findings, reduce, results
 from spec import editions
 
@@ -60,7 +62,9 @@ def test_the_kit_finds_what_is_recorded(name: str) -> None:
     recorded = set(failing(result))
     with candidate(str(EXAMPLES / f"{name}_adapter.py"), None, result["dtype"], None, 60) as adapter:
         assert adapter.version == version
-        offered = {check.name for check in selected_checks(result["dtype"]) if not missing(adapter, check)}
+        setting = Setting(result["dtype"], editions()[result["edition"]].profile, 0, 1)
+        checks = [narrowed(check, adapter, setting) for check in selected_checks(result["dtype"])]
+        offered = {check.name for check in checks if not missing(adapter, check)}
         assert offered == set(result["checks"])
         found = failing_checks(adapter, result, offered, FEW)
         assert found <= recorded
