@@ -1,5 +1,7 @@
 """Cases in order: those that a check writes down, and those that hypothesis draws."""
 
+import contextlib
+import dataclasses
 import functools
 import math
 import time
@@ -9,6 +11,7 @@ from typing import Any
 import hypothesis
 import hypothesis.strategies as st
 import numpy as np
+from hypothesis.database import InMemoryExampleDatabase
 
 from conformance.case import Case, Cases, Drawn, Setting
 from conformance.compare import Deviation, entries
@@ -16,60 +19,94 @@ from conformance.strategies import ordinary_numbers
 
 SHRINKING = 2.0  # seconds in which hypothesis may look for a smaller case that deviates
 DRAW_BYTES = 8192
-ATTEMPTS = 100
+IN_VAIN = 100  # draws in a row that give no example, or one that is there already, until there are no others
 
 Strategies = Mapping[str, st.SearchStrategy[Any]]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Example:
+    """The bytes that values were drawn from. What hypothesis draws by itself depends on the code that happens to be
+    imported; these cases are the same everywhere."""
+
+    drawn: Drawn
+    data: bytes
 
 
 @functools.lru_cache(maxsize=1024)
 def cases(
     build: Callable[[Setting], Cases], setting: Setting, ordinary: bool = False
-) -> tuple[tuple[Case, Drawn | None], ...]:
-    """The cases of a check, each with what it was drawn by; always the same.
+) -> tuple[tuple[Case, Example | None], ...]:
+    """The cases of a check, each with the example that it is of, if it was drawn; always the same.
 
     ordinary: those alone that have no extreme input.
     """
-    found: list[tuple[Case, Drawn | None]] = []
+    found: list[tuple[Case, Example | None]] = []
+    drawn = 0
     with ordinary_numbers(ordinary), np.errstate(all="ignore"):
         for item in build(setting):
             if isinstance(item, Case):
                 found.append((item, None))
             else:
-                for drawn in draw(item, setting):
-                    found += [(case, item) for case in drawn]
-    return tuple((case, drawn) for case, drawn in found if not (ordinary and case.is_extreme))
+                found += draw(item, setting, drawn)
+                drawn += 1
+    return tuple((case, example) for case, example in found if not (ordinary and case.is_extreme))
 
 
-def draw(drawn: Drawn, setting: Setting) -> list[list[Case]]:
-    """What hypothesis draws where nothing deviates: the cases of each example."""
-    examples: list[list[Case]] = []
-    run_examples(lambda **values: examples.append(list(built(drawn, values))), drawn.strategies, setting, shrink=False)
-    return examples
+def draw(drawn: Drawn, setting: Setting, number: int) -> Iterator[tuple[Case, Example]]:
+    """The cases of an example after the other. number: of what is drawn in a check, so that it differs each time."""
+    found: list[Case] = []
+
+    def keep(**values: Any) -> None:
+        found[:] = built(drawn, values)
+
+    for data in _different(_test(drawn.strategies, keep, setting), setting, number):
+        yield from [(case, Example(drawn, data)) for case in found]
 
 
-def draw_from_bytes(drawn: Drawn, setting: Setting, number: int) -> Iterator[Case]:
-    """The cases of as many examples from bytes of NumPy's generator: what hypothesis draws by itself depends on the
-    code that happens to be imported."""
-    examples: list[list[Case]] = []
-    quiet = hypothesis.settings(database=None, deadline=None, suppress_health_check=list(hypothesis.HealthCheck))
-    collect = _taking(drawn.strategies, lambda **values: examples.append(list(built(drawn, values))))
-    test: Any = quiet(collect)
-    rng = np.random.default_rng([setting.seed, number])
-    for _ in range(ATTEMPTS * setting.examples):
-        if len(examples) < setting.examples:
-            test.hypothesis.fuzz_one_input(rng.bytes(DRAW_BYTES))
-    for example in examples:
-        yield from example
-
-
-def smallest(drawn: Drawn, setting: Setting, judge: Callable[[Case], None]) -> None:
-    """Draws again and judges; raises what the smallest example raises that hypothesis finds in time."""
+def smallest(example: Example, setting: Setting, judge: Callable[[Case], None]) -> None:
+    """Judges an example that deviates again; raises what the smallest one raises that hypothesis makes of it in
+    time."""
 
     def judge_all(**values: Any) -> None:
-        for case in built(drawn, values):
+        for case in built(example.drawn, values):
             judge(case)
 
-    run_examples(judge_all, drawn.strategies, setting, shrink=True)
+    shrinking = _Shrinking(judge_all)
+    test = _test(example.drawn.strategies, shrinking.run, setting)
+    with contextlib.suppress(Exception):
+        test.hypothesis.fuzz_one_input(example.data)  # hypothesis keeps what fails
+    shrinking.search(test)
+
+
+def run_examples(
+    body: Callable[..., None], strategies: Strategies, setting: Setting, shrink: bool, number: int = 0
+) -> None:
+    """Runs a function on the values of one example after the other; what it raises first is raised, and with `shrink`
+    on the smallest values."""
+    shrinking = _Shrinking(body)
+    test = _test(strategies, shrinking.run, setting)
+    try:
+        for _ in _different(test, setting, number):
+            pass
+    except Exception:
+        if shrink:
+            shrinking.search(test)
+        raise
+
+
+def _different(test: Any, setting: Setting, number: int) -> Iterator[bytes]:
+    """Runs a test on different examples, the simplest one first, and says which bytes each was drawn from."""
+    rng, seen, data = np.random.default_rng([setting.seed, number]), set[bytes](), bytes(DRAW_BYTES)
+    in_vain = 0
+    while len(seen) < setting.examples and in_vain < IN_VAIN:
+        used = test.hypothesis.fuzz_one_input(data)
+        in_vain += 1
+        if used is not None and used not in seen:
+            seen.add(used)
+            in_vain = 0
+            yield used
+        data = rng.bytes(DRAW_BYTES)
 
 
 def built(drawn: Drawn, values: dict[str, Any]) -> Iterator[Case]:
@@ -78,29 +115,21 @@ def built(drawn: Drawn, values: dict[str, Any]) -> Iterator[Case]:
         yield case
 
 
-def run_examples(body: Callable[..., None], strategies: Strategies, setting: Setting, shrink: bool) -> None:
-    """Runs a function on drawn values; what it raises first is raised, and with `shrink` on the smallest values."""
-    shrinking = _Shrinking(body)
-    phases = [phase for phase in hypothesis.Phase if shrink or phase is not hypothesis.Phase.shrink]
-    wrapped = hypothesis.settings(
-        max_examples=setting.examples,
-        deadline=None,
-        database=None,
-        suppress_health_check=list(hypothesis.HealthCheck),
-        phases=phases,
-        report_multiple_bugs=False,  # several deviations would come as a group, which is no Deviation
-    )(_taking(strategies, shrinking.run))
-    try:
-        hypothesis.seed(setting.seed)(wrapped)()
-    except _Enough:
-        shrinking.repeat_smallest()
+def _test(strategies: Strategies, body: Callable[..., None], setting: Setting) -> Any:
+    """A test of hypothesis that, called, repeats what has failed and makes it smaller."""
 
-
-def _taking(strategies: Strategies, body: Callable[..., None]) -> Callable[..., None]:
     def one_example(**values: Any) -> None:
         body(**values)
 
-    return hypothesis.given(**strategies)(one_example)
+    return hypothesis.settings(
+        max_examples=setting.examples,
+        deadline=None,
+        database=InMemoryExampleDatabase(),
+        suppress_health_check=list(hypothesis.HealthCheck),
+        phases=(hypothesis.Phase.reuse, hypothesis.Phase.shrink),
+        report_multiple_bugs=False,  # several deviations would come as a group, which is no Deviation
+        print_blob=False,
+    )(hypothesis.given(**strategies)(one_example))
 
 
 class _Enough(BaseException):
@@ -108,7 +137,7 @@ class _Enough(BaseException):
 
 
 class _Shrinking:
-    """Runs a function on drawn values; ends the search for smaller ones that fail some seconds after the first."""
+    """Runs a function on drawn values, and finds smaller ones that fail for some seconds after the first."""
 
     def __init__(self, body: Callable[..., None]) -> None:
         self._body = body
@@ -128,9 +157,12 @@ class _Shrinking:
                 self._size, self._smallest = size, values
             raise
 
-    def repeat_smallest(self) -> None:
-        """Fails once more with the smallest values that were found."""
-        self._body(**self._smallest)
+    def search(self, test: Callable[[], None]) -> None:
+        """Fails once more with the smallest values that hypothesis finds."""
+        try:
+            test()
+        except _Enough:
+            self._body(**self._smallest)
         raise Deviation("a case that deviated does not deviate again: the candidate is not deterministic")
 
 

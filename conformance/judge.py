@@ -46,14 +46,14 @@ def judge_cases(
     ordinary: leaves those out that have extreme input. shrink: makes drawn values smaller that deviate, which takes
     longer. any_error: a candidate that is somebody else's program may refuse with any exception.
     """
-    for case, drawn in cases(build, setting, ordinary):
+    for case, example in cases(build, setting, ordinary):
         try:
             judge_case(case, ask, comparisons, any_error)
         except NotImplementedError:
             raise
         except Exception:
-            if drawn is not None and shrink and not ordinary:
-                smallest(drawn, setting, lambda case: judge_case(case, ask, comparisons, any_error))
+            if example is not None and shrink and not ordinary:
+                smallest(example, setting, lambda case: judge_case(case, ask, comparisons, any_error))
             raise
 
 

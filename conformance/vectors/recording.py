@@ -11,7 +11,7 @@ from conformance.adapters.numpy_adapter import NumpyAdapter
 from conformance.case import Call, Case, Equal, Setting
 from conformance.check import Check
 from conformance.compare import BOUND, DTYPES, EPSILON, Path, entries, part_of, relative_deviation, round_to, scale_of
-from conformance.drawing import draw_from_bytes
+from conformance.drawing import cases
 from conformance.execute import missing
 from conformance.judge import copied
 from spec import Config
@@ -94,23 +94,12 @@ def record(check: Check, profile: str, seed: int, examples: int) -> list[Vector]
 
 def _asked(check: Check, setting: Setting) -> list[_Asked]:
     """Every call of a check's cases."""
+    assert check.cases is not None
     return [
         _Asked(call, dict(_golden(case, index, setting)), case.refused.naming if case.refused else None)
-        for case in _cases(check, setting)
+        for case, _ in cases(check.cases, setting)
         for index, call in enumerate(case.calls)
     ]
-
-
-def _cases(check: Check, setting: Setting) -> Iterator[Case]:
-    assert check.cases is not None
-    drawn = 0
-    with np.errstate(all="ignore"):
-        for item in check.cases(setting):
-            if isinstance(item, Case):
-                yield item
-            else:
-                drawn += 1
-                yield from draw_from_bytes(item, setting, drawn)
 
 
 def _golden(case: Case, call: int, setting: Setting) -> Iterator[tuple[Path, _Golden]]:
