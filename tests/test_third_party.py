@@ -17,7 +17,10 @@ from spec import editions
 
 SERVE = Path(__file__).resolve().parent.parent / "conformance" / "serve.py"
 EXAMPLES = SERVE.parent / "examples"
-MODULES = {"di_engine": "ding", "rllib": "ray", "sheeprl_v3_5": "sheeprl"}  # the others are called as their packages
+MODULES = {  # the others are called as their packages
+    **{"di_engine": "ding", "rllib": "ray", "sheeprl_v3_5": "sheeprl"},
+    **{"dreamerv3_torch": "exploration", "r2dreamer": "rssm"},
+}
 FEW, MANY = 10, 250  # cases of a property
 SLOW = {"equinox", "haiku"}  # JAX compiles each layer of each shape
 BESIDE_US = [
@@ -83,8 +86,9 @@ def test_the_kit_finds_what_is_recorded_through_a_process(name: str) -> None:
         if adapter.version != result["version"]:
             pytest.skip(f"recorded with {name} {result['version']}, installed is {adapter.version}")
         found = run_checks(adapter, result, set(result["checks"]), result["examples"])
-    assert {run.check.name: run.status for run in found} == {
-        check: entry["status"] for check, entry in result["checks"].items()
+    # The record has the smallest case that fails, which may raise where the first one gives a wrong number.
+    assert {run.check.name: run.status in FAILING for run in found} == {
+        check: entry["status"] in FAILING for check, entry in result["checks"].items()
     }
 
 
