@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 from rich.console import Console
 
+from conformance import threads  # noqa: F401
 from conformance.commands import COMMANDS
 from conformance.errors import UserError, say_error
 from conformance.output import never_fail

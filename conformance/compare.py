@@ -69,6 +69,7 @@ class Comparisons:
         self.worst = Worst()
         self.compared = 0
         self.call: Call | None = None
+        self.left_out: list[str] = []
 
     def compare(
         self,

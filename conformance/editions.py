@@ -182,6 +182,7 @@ def _compared(
     if ordinary and check.script:
         ask = standing_in(ask, MutantAdapter(mutant))
     unjudged = Unjudged(setting.dtype)
+    unjudged.left_out = comparisons.left_out
     body = functools.partial(run, check, setting, ask, unjudged, adapter, shrink, ordinary)
     return outcome(check, adapter, comparisons, body)
 

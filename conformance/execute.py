@@ -21,7 +21,8 @@ from spec import editions
 
 FAILING = ("fail", "error")
 NOT_IMPLEMENTED = "not implemented: "
-"""How the message of a check begins that is not offered because the candidate raised a `NotImplementedError`."""
+"""How the message of a check begins where the candidate raised a `NotImplementedError`: one that is not offered, or
+passes in its other cases."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,6 +57,11 @@ class Result:
     call: FailedCall | None = None
     extreme: bool = False
 
+    @property
+    def is_partial(self) -> bool:
+        """Whether it passed in some of its cases, and the others ask for what the candidate does not have."""
+        return self.status == "pass" and bool(self.check.lacking or self.message)
+
 
 @dataclasses.dataclass(frozen=True)
 class CheckOptions:
@@ -88,7 +94,7 @@ class RequirementResult:
     @property
     def status(self) -> str:
         statuses = {result.status for result in self.results}
-        statuses |= {"not offered" for result in self.results if result.check.lacking}
+        statuses |= {"not offered" for result in self.results if result.is_partial}
         for status in ("error", "fail", "not offered"):
             if status in statuses:
                 return status
@@ -166,9 +172,12 @@ def outcome(check: Check, adapter: object, comparisons: Comparisons, body: Calla
         ):  # not of our own implementations
             return not_implemented(check, comparisons.call.function if comparisons.call else check.name, str(error))
         return result("error", broken, traceback.format_exc(limit=-4))
+    lacking = NOT_IMPLEMENTED + ", ".join(dict.fromkeys(comparisons.left_out)) if comparisons.left_out else ""
+    if lacking and not comparisons.compared:
+        return Result(check, "not offered", Worst(), 0, lacking)
     if not comparisons.compared:
         return Result(check, "error", comparisons.worst, 0, "the check compared nothing")
-    return Result(check, "pass", comparisons.worst, comparisons.compared)
+    return Result(check, "pass", comparisons.worst, comparisons.compared, lacking)
 
 
 def _failed(call: Call | None, deviation: Deviation | None) -> FailedCall | None:

@@ -44,13 +44,16 @@ def judge_cases(
     """Judges the cases of a check in their order, up to the first deviation.
 
     ordinary: leaves those out that have extreme input. shrink: makes drawn values smaller that deviate, which takes
-    longer. any_error: a candidate that is somebody else's program may refuse with any exception.
+    longer. any_error: a candidate that is somebody else's program may refuse with any exception, and may say of some
+    cases that it lacks what they ask for: the others count.
     """
     for case, example in cases(build, setting, ordinary):
         try:
             judge_case(case, ask, comparisons, any_error)
-        except NotImplementedError:
-            raise
+        except NotImplementedError as error:
+            if not any_error:
+                raise
+            comparisons.left_out.append(f"{case.calls[0].function} ({error})")
         except Exception:
             if example is not None and shrink and not ordinary:
                 smallest(example, setting, lambda case: judge_case(case, ask, comparisons, any_error))

@@ -27,6 +27,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 PROTOCOL = 1
+OBJECTS = ("Learner", "Replay", "ReplayRatio")  # their results have methods, which no message holds
 DTYPES = ("bool", "uint8", "int32", "int64", "float32", "float64")
 
 
@@ -166,6 +167,7 @@ def _result(adapter: Any, request: Mapping[str, Any]) -> Any:
             raise BadMessage(f"this server speaks protocol {PROTOCOL}, not {request.get('protocol')!r}")
         getattr(adapter, "setup", lambda dtype: None)(request["dtype"])
         names = [name for name in dir(adapter) if not name.startswith("_") and callable(getattr(adapter, name))]
+        names = [name for name in names if name not in OBJECTS]
         names += ["vjp"] if "convert" in names and "vjp" not in names else []
         return {
             "protocol": PROTOCOL,

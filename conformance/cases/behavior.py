@@ -139,14 +139,15 @@ def actions_match(setting: Setting) -> Cases:
 
 @check("BEH-2", "BEH-4", "BEH-6", "BEH-7", "BEH-22", uses=["action_log_prob", "action_entropy"], level=0)
 def log_prob_and_entropy_match(setting: Setting) -> Cases:
-    """Sums over keys, entries and dimensions of any action, also of one far from the mean and of a blanked one."""
+    """Sums over keys, entries and dimensions of any action, also of one far from the mean."""
 
     def case(seed: int, leading: tuple[int, ...], scale: float, unimix: float) -> Cases:
         config = config_of(setting, actor_unimix=unimix, actor_min_std=0.05)
         outputs = random_outputs(setting, seed, leading, scale)
         noise = action_noise(np.random.default_rng(seed), TASK, leading)
-        action = setting.cast(reference.sample_action(outputs, noise, TASK, config) * (seed % 3))
-        action[..., 1:7] = np.minimum(action[..., 1:7], 1)
+        action = setting.cast(reference.sample_action(outputs, noise, TASK, config))
+        action[..., :1] *= seed % 3
+        action[..., 7:] *= seed % 3
         size = log_prob_magnitude(outputs, action, config)
         expected = reference.action_log_prob(outputs, action, TASK, config)
         yield equal("action_log_prob", (outputs, action, TASK, config), expected, magnitude=size, bound=16 * setting.u)
@@ -161,6 +162,18 @@ def log_prob_and_entropy_match(setting: Setting) -> Cases:
         scale=st.sampled_from([0.5, 4.0, 60.0]),
         unimix=st.sampled_from([0.0, 0.01, 0.5]),
     )
+
+
+@check("BEH-6", "DIS-10", uses=["action_log_prob"], level=0)
+def blanked_actions_count_nothing(setting: Setting) -> Cases:
+    """The zeros that stand for an action before the first step of an episode: no class of theirs is counted."""
+    config, outputs = config_of(setting, actor_min_std=0.05), random_outputs(setting, setting.seed, (3,), 1.0)
+    action = np.zeros((3, TASK.action_size))
+    expected, size = (
+        reference.action_log_prob(outputs, action, TASK, config),
+        log_prob_magnitude(outputs, action, config),
+    )
+    yield equal("action_log_prob", (outputs, action, TASK, config), expected, magnitude=size, bound=16 * setting.u)
 
 
 @check("BEH-9", uses=["actor_loss"], level=0)

@@ -64,7 +64,7 @@ def pulled_back(
         return sum(np.sum(weight * result) for weight, result in zip(cotangents, results, strict=True))
 
     start = all_reals(arguments, names)
-    along = {name: rng.normal(size=(DIRECTIONS, *array.shape)) for name, array in start.items()}
+    along = {name: directions(rng, name, array) for name, array in start.items()}
     expected = {
         name: np.array([directional_derivative(total, start, {name: way}, STEP) for way in ways])
         for name, ways in along.items()
@@ -80,6 +80,12 @@ def pulled_back(
 
     weights = dict(zip(RESULTS[called], cotangents, strict=True)) if called in RESULTS else cotangents[0]
     return Case((Call("vjp", (called, arguments, weights)),), (Related(same),))
+
+
+def directions(rng: np.random.Generator, name: str, start: np.ndarray) -> np.ndarray:
+    """[DIRECTIONS, ...]: random ones; log-probabilities stay normalized along them."""
+    noise = rng.normal(size=(DIRECTIONS, *start.shape))
+    return noise - np.sum(np.exp(start) * noise, -1, keepdims=True) if name.startswith("log_probs") else noise
 
 
 def as_tuple(results: Any) -> tuple[Any, ...]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from conformance.case import Cases, Drawn, Setting, equal, judged, related
 from conformance.cases import losses
-from conformance.cases.agent import STEP, WHOLE, Example, example_of, gradient_is_right, step_follows
+from conformance.cases.agent import STEP, WHOLE, Example, example_of, gradient_is_right, step_follows, step_of
 from conformance.cases.rssm import SIZES, imagine_arguments, observe_arguments, reference_imagine
 from conformance.check import check
 from conformance.problems import small_config
@@ -143,8 +143,7 @@ def gradients_given_match(setting: Setting) -> Cases:
 def train_step_given_matches(setting: Setting) -> Cases:
     """Parameters, moments, slow critic and return range after one step with given samples."""
     for observation, action in (("vector", "discrete"), ("both", "mixed")):
-        example = example_of(setting, observation, action)
-        problem = example.problem
+        example, problem = example_of(setting, observation, action), step_of(setting, observation, action)
         inputs = (problem.state, problem.batch, samples_of(example), problem.spaces, problem.config)
         relation = step_follows(setting, f"{observation}, {action}: ", problem)
         yield related(relation, ("gradients_given", given_arguments(example)), ("train_step_given", inputs))

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from conformance.case import Cases, Equal, Setting, judged, related
-from conformance.cases.agent import SAMPLING_MARGIN, WHOLE, Example, bound_of
+from conformance.cases.agent import LOSS_BOUND, SAMPLING_MARGIN, WHOLE, Example, bound_of
 from conformance.cases.losses import demands_of
 from conformance.check import check
 from conformance.compare import Comparisons
@@ -165,7 +165,7 @@ def losses_with_unusual_options_match(setting: Setting) -> Cases:
     for number in range(UNUSUAL):
         example = unusual_example(setting.seed, number, setting.profile, setting.dtype)
         reach = max(1.0, *map(abs, example.losses[1]["return_range"]))
-        demands = demands_of(example, f"options {number}: ", bound_of(setting, 1e-9, 2e-4), reach)
+        demands = demands_of(example, f"options {number}: ", bound_of(setting, 1e-9, LOSS_BOUND), reach)
         yield judged("losses", example.problem.loss_arguments, *demands.values())
 
 

@@ -13,7 +13,15 @@ from typing import Any
 import numpy as np
 
 from conformance.case import Case, Cases, Equal, Setting, exactly, judged, related
-from conformance.cases.agent import SAMPLING_MARGIN, WHOLE, Example, bound_of, gradient_along, problem_of
+from conformance.cases.agent import (
+    LOSS_BOUND,
+    SAMPLING_MARGIN,
+    WHOLE,
+    Example,
+    bound_of,
+    gradient_along,
+    problem_of,
+)
 from conformance.cases.losses import demands_of
 from conformance.check import check
 from conformance.compare import Comparisons
@@ -66,7 +74,8 @@ def losses_of_a_batch_match(setting: Setting) -> Cases:
     problem = batch_of_a_run(setting).problem
     moving = dataclasses.replace(problem, config=dataclasses.replace(problem.config, return_decay=0.9))
     example = Example(moving, setting.seed)
-    yield judged("losses", moving.loss_arguments, *demands_of(example, "", bound_of(setting, 1e-9, 2e-4)).values())
+    demands = demands_of(example, "", bound_of(setting, 1e-9, LOSS_BOUND))
+    yield judged("losses", moving.loss_arguments, *demands.values())
 
 
 @check("AGT-28", "AGT-32", "CON-12", "CON-23", "LAY-2", "LAY-3", uses=["gradients"], level=2, dtypes=WHOLE)
@@ -95,7 +104,7 @@ def losses_of_another_batch_match(setting: Setting) -> Cases:
     for rows, steps in ((7, 11), (1, 3)):
         config = dataclasses.replace(problem.config, batch_size=rows, batch_length=steps)
         other = dataclasses.replace(problem, config=config)
-        demands = demands_of(Example(other, setting.seed), f"{rows} x {steps}: ", bound_of(setting, 1e-9, 2e-4))
+        demands = demands_of(Example(other, setting.seed), f"{rows} x {steps}: ", bound_of(setting, 1e-9, LOSS_BOUND))
         yield judged("losses", other.loss_arguments, *demands.values())
 
 
@@ -104,7 +113,7 @@ def losses_of_equal_sizes_match(setting: Setting) -> Cases:
     """Every loss, metric and latent where as many axes as possible have the same size, so that an exchange of two gives
     no error."""
     example = equal_sizes(setting)
-    demands = demands_of(example, "", bound_of(setting, 1e-9, 2e-4))
+    demands = demands_of(example, "", bound_of(setting, 1e-9, LOSS_BOUND))
     yield judged("losses", example.problem.loss_arguments, *demands.values())
 
 

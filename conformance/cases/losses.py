@@ -12,6 +12,7 @@ from conformance.case import Cases, Equal, Setting, judged
 from conformance.cases.agent import (
     COMBINATIONS,
     GROUPS,
+    LOSS_BOUND,
     WHOLE,
     Example,
     bound_of,
@@ -57,8 +58,10 @@ def demands_of(example: Example, where: str, bound: float, reach: float = 1.0) -
     relative."""
     total, aux = example.losses
     size, range_ = loss_magnitude(aux), np.array(aux["return_range"])
+    returns = ("return_scale", "return_mean", "value_mean")
+    sizes = dict.fromkeys(returns, max(size, reach))
     means = {
-        name: Equal(mean, (1, group, name), where=where + name, magnitude=size, bound=bound)
+        name: Equal(mean, (1, group, name), where=where + name, magnitude=sizes.get(name, size), bound=bound)
         for group in ("losses", "metrics")
         for name, mean in aux[group].items()
     }
@@ -76,7 +79,7 @@ def passes(setting: Setting, *outputs: str, ask: Ask = with_noise) -> Cases:
     """A case for each kind of task, of the outputs with these names; "reconstruction" is that of every key."""
     for observation, action in COMBINATIONS:
         example = example_of(setting, observation, action)
-        demands = demands_of(example, f"{observation}, {action}: ", bound_of(setting, 1e-9, 2e-4))
+        demands = demands_of(example, f"{observation}, {action}: ", bound_of(setting, 1e-9, LOSS_BOUND))
         chosen = [demand for name, demand in demands.items() if name.partition("/")[0] in outputs]
         relations = (all_losses(example),) if "total" in outputs else ()
         yield judged(*ask(example), *chosen, *relations)

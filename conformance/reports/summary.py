@@ -217,7 +217,7 @@ def unchecked(data: Data) -> list[str]:
     """Lines, if any: the functions that are offered and that no check could use, and what is said to be not
     implemented."""
     lacking = [f"{entry['function']} (needs {', '.join(entry['needs'])})" for entry in data["unchecked"]]
-    messages = (check["message"] for check in data["checks"].values() if check["status"] == "not offered")
+    messages = (check["message"] for check in data["checks"].values() if check["status"] in ("not offered", "pass"))
     absent = dict.fromkeys(
         message.removeprefix(NOT_IMPLEMENTED).rstrip() for message in messages if message.startswith(NOT_IMPLEMENTED)
     )
