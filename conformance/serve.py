@@ -271,6 +271,8 @@ def _torch_vjp(function: Any, arguments: Any, leaves: list[Any], cotangents: Any
     if not getattr(total, "requires_grad", False):
         raise NotImplementedError("gradients: its results have none")
     found = torch.autograd.grad(total, leaves, allow_unused=True)
+    if all(gradient is None for gradient in found):
+        raise NotImplementedError("gradients: its results do not come from the tensors that it was given")
     return [torch.zeros_like(leaf) if gradient is None else gradient for leaf, gradient in zip(leaves, found)]  # noqa: B905
 
 

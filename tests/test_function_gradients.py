@@ -105,6 +105,10 @@ def test_wrong_gradients_fail_where_the_values_are_right(tmp_path: Path, source:
     [
         (KL.replace("p, q = ", "posterior = torch.as_tensor(posterior.numpy()); p, q = "), "its tensors leave PyTorch"),
         (DETACHED, "its results have none"),
+        (
+            DETACHED.replace("dynamics, rep", "p, q = p.requires_grad_(), q; dynamics, rep"),
+            "do not come from the tensors that it was given",
+        ),
     ],
 )
 def test_gradients_that_cannot_be_seen_count_as_not_offered(tmp_path: Path, source: str, reason: str) -> None:

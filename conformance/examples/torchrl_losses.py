@@ -102,7 +102,8 @@ def actor_loss(log_prob, entropy, returns, value, weight, scale, config):
         return module(data)[0]["loss_actor"]
 
     rows = (x.flatten() for x in (log_prob, entropy, returns, value, weight))
-    return torch.stack([one(*numbers) for numbers in zip(*rows, strict=True)]).reshape(log_prob.shape)
+    # Detached: the module samples its actions anew, and holds logits as parameters, so that no gradient leads back here.
+    return torch.stack([one(*numbers) for numbers in zip(*rows, strict=True)]).reshape(log_prob.shape).detach()
 
 
 class Given(nn.Module):
@@ -135,7 +136,7 @@ def value_loss_module(config, logits, slow_logits):
 
 def critic_loss(logits, slow_logits, returns, weight, config):
     data = {"state": returns[..., None], "lambda_target": returns[..., None], "discount_weight": weight[..., None]}
-    return value_loss_module(config, logits, slow_logits)(TensorDict(data, returns.shape))[0]["loss_value"]
+    return value_loss_module(config, logits, slow_logits)(TensorDict(data, returns.shape))[0]["loss_value"].detach()
 
 
 def replay_critic_loss(logits, slow_logits, returns, is_last, config):

@@ -116,7 +116,8 @@ def judged(
     Raises:
       RuntimeError: judging itself does not work.
     """
-    dtypes = ["float64"] if patch.candidate == "trainer" else list(DTYPES)
+    likeliest = "bfloat16" if patch.kind == "precision" else "float32"
+    dtypes = ["float64"] if patch.candidate == "trainer" else sorted(DTYPES, key=lambda dtype: dtype != likeliest)
     request = {
         "candidate": patch.candidate,
         "file": patch.file,
