@@ -102,7 +102,7 @@ def actor_loss(log_prob, entropy, returns, value, weight, scale, config):
         return module(data)[0]["loss_actor"]
 
     rows = (x.flatten() for x in (log_prob, entropy, returns, value, weight))
-    # Detached: the module samples its actions anew, and holds logits as parameters, so that no gradient leads back here.
+    # Detached: the module samples anew and holds logits as parameters of its own, so no gradient leads back here.
     return torch.stack([one(*numbers) for numbers in zip(*rows, strict=True)]).reshape(log_prob.shape).detach()
 
 
