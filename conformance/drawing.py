@@ -2,7 +2,6 @@
 
 import functools
 import math
-import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
@@ -14,7 +13,7 @@ from conformance.case import Case, Cases, Drawn, Setting
 from conformance.compare import Deviation, entries
 from conformance.strategies import ordinary_numbers
 
-SHRINKING = 2.0  # seconds in which hypothesis may look for a smaller case that deviates
+SHRINKING = 100  # examples that hypothesis may try to find a smaller one that deviates
 DRAW_BYTES = 8192
 ATTEMPTS = 100
 
@@ -62,16 +61,6 @@ def draw_from_bytes(drawn: Drawn, setting: Setting, number: int) -> Iterator[Cas
         yield from example
 
 
-def smallest(drawn: Drawn, setting: Setting, judge: Callable[[Case], None]) -> None:
-    """Draws again and judges; raises what the smallest example raises that hypothesis finds in time."""
-
-    def judge_all(**values: Any) -> None:
-        for case in built(drawn, values):
-            judge(case)
-
-    run_examples(judge_all, drawn.strategies, setting, shrink=True)
-
-
 def built(drawn: Drawn, values: dict[str, Any]) -> Iterator[Case]:
     for case in drawn.build(**values):
         assert isinstance(case, Case), "what is drawn does not draw again"
@@ -104,26 +93,28 @@ def _taking(strategies: Strategies, body: Callable[..., None]) -> Callable[..., 
 
 
 class _Enough(BaseException):
-    """No more time for smaller cases. Not an Exception: hypothesis would take it for another way to fail."""
+    """Smaller cases were looked for long enough. Not an Exception: hypothesis would take it for another way to fail."""
 
 
 class _Shrinking:
-    """Runs a function on drawn values; ends the search for smaller ones that fail some seconds after the first."""
+    """Runs a function on drawn values; ends the search for smaller ones that fail after a number of attempts, which no
+    clock decides: the same input is found on every machine."""
 
     def __init__(self, body: Callable[..., None]) -> None:
         self._body = body
-        self._since, self._size = math.inf, math.inf
+        self._left, self._size = SHRINKING, math.inf
         self._smallest: dict[str, Any] = {}
 
     def run(self, **values: Any) -> None:
-        if time.monotonic() - self._since > SHRINKING:
+        if self._smallest:
+            self._left -= 1
+        if self._left < 0:
             raise _Enough
         try:
             self._body(**values)
         except hypothesis.errors.UnsatisfiedAssumption:
             raise
         except Exception:
-            self._since = min(self._since, time.monotonic())
             if (size := _count(values)) <= self._size:
                 self._size, self._smallest = size, values
             raise

@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from conformance.case import Call, Case, Equal, Refused, Setting
+from conformance.case import Call, Case, Drawn, Equal, Refused, Setting
 from conformance.compare import Comparisons, is_extreme
-from conformance.drawing import cases, smallest
+from conformance.drawing import built, cases, run_examples
 
 COPIED = 2**16  # numbers of an array up to which arguments are kept as they were
 
@@ -41,24 +41,64 @@ def judge_cases(
     shrink: bool = True,
     any_error: bool = False,
 ) -> None:
-    """Judges the cases of a check in their order, up to the first deviation.
+    """Judges the cases of a check up to the first deviation, the most ordinary first: examples of the chapter, others
+    that are written down, drawn ones, and those with extreme input.
 
-    ordinary: leaves those out that have extreme input. shrink: makes drawn values smaller that deviate, which takes
-    longer. any_error: a candidate that is somebody else's program may refuse with any exception.
+    ordinary: leaves the last out. shrink: makes drawn values smaller that deviate, which takes longer. any_error: a
+    candidate that is somebody else's program may refuse with any exception.
     """
-    for case, drawn in cases(build, setting, ordinary):
+    for case, drawn in sorted(cases(build, setting, ordinary), key=_how_special):
+        comparisons.drawn = drawn is not None
         try:
             judge_case(case, ask, comparisons, any_error)
         except NotImplementedError:
             raise
         except Exception:
-            if drawn is not None and shrink and not ordinary:
-                smallest(drawn, setting, lambda case: judge_case(case, ask, comparisons, any_error))
+            if drawn is not None and shrink:
+                judge_drawn(drawn, setting, ask, comparisons, any_error)
             raise
+
+
+def _how_special(item: tuple[Case, Drawn | None]) -> tuple[bool, bool, bool]:
+    case, drawn = item
+    return case.is_extreme, drawn is not None, not case.by_hand
+
+
+def judge_ordinary_cases(
+    build: Callable[[Setting], Any], setting: Setting, ask: Ask, comparisons: Comparisons, any_error: bool = False
+) -> None:
+    """Judges the ordinary cases of a check in their order, each as soon as it is built: for many cases of which one of
+    the first will deviate. Drawn values that deviate are made smaller. Call it within `ordinary_numbers`."""
+    for item in build(setting):
+        comparisons.drawn = isinstance(item, Drawn)
+        if isinstance(item, Drawn):
+            judge_drawn(item, setting, ask, comparisons, any_error, ordinary=True)
+        elif not item.is_extreme:
+            judge_case(item, ask, comparisons, any_error)
+
+
+def judge_drawn(
+    drawn: Drawn,
+    setting: Setting,
+    ask: Ask,
+    comparisons: Comparisons,
+    any_error: bool = False,
+    ordinary: bool = False,
+) -> None:
+    """Draws and judges; raises what the smallest example raises that hypothesis finds. ordinary: leaves cases with
+    extreme input out."""
+
+    def judge_all(**values: Any) -> None:
+        for case in built(drawn, values):
+            if not (ordinary and case.is_extreme):
+                judge_case(case, ask, comparisons, any_error)
+
+    run_examples(judge_all, drawn.strategies, setting, shrink=True)
 
 
 def judge_case(case: Case, ask: Ask, comparisons: Comparisons, any_error: bool = False) -> None:
     """Raises `Deviation` unless all demands are met, or what the candidate raises."""
+    comparisons.case = case
     if case.refused is not None:
         judge_refusal(case.calls[0], case.refused, ask, comparisons, any_error)
         return
