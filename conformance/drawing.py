@@ -13,7 +13,7 @@ from conformance.case import Case, Cases, Drawn, Setting
 from conformance.compare import Deviation, entries
 from conformance.strategies import ordinary_numbers
 
-SHRINKING = 100  # examples that hypothesis may try to find a smaller one that deviates
+SHRINKING = 50  # examples that hypothesis may try to find a smaller one that deviates
 DRAW_BYTES = 8192
 ATTEMPTS = 100
 

@@ -58,7 +58,7 @@ def telling_checks(checks: Iterable[Check]) -> list[Check]:
     """Those by which editions can be told apart: of a requirement that an edition has otherwise, by a mutant or by a
     setting.
 
-    Gradients are left out: they are slow, and tell nothing that the losses do not.
+    Gradients and large batches are left out: they are slow, and tell nothing that the losses of small ones do not.
     """
     told = {
         name
@@ -66,7 +66,11 @@ def telling_checks(checks: Iterable[Check]) -> list[Check]:
         for name, difference in edition.differs.items()
         if difference.is_modelled
     }
-    return [check for check in checks if not told.isdisjoint(check.requirements) and GRADIENTS.isdisjoint(check.uses)]
+    return [
+        check
+        for check in checks
+        if not told.isdisjoint(check.requirements) and GRADIENTS.isdisjoint(check.uses) and not check.is_large
+    ]
 
 
 def judge(
@@ -252,6 +256,17 @@ def fit(checks: Iterable[Check], adapter: object, dtype: str, seed: int = 0, exa
             statuses[check.name] = NOT_JUDGED if status == "not offered" else status
             broken |= status == "error"
     return [Fit(name, statuses) for name, statuses in found.items()]
+
+
+def may_fit_better(failing: Iterable[Check], adapter: object, chosen: Edition, dtype: str, seed: int = 0) -> bool:
+    """Whether one of the checks that fail in the chosen edition passes in another with ordinary input: where none does,
+    no edition can fit better."""
+    others = [edition for name, edition in editions().items() if name != chosen.name]
+    return any(
+        judge(check, adapter, edition, dtype, seed, FIT_EXAMPLES, shrink=False, ordinary=True).status == "pass"
+        for check in failing
+        for edition in others
+    )
 
 
 def best(fits: Iterable[Fit]) -> Fit:
