@@ -15,6 +15,7 @@ in another edition and writing golden vectors are loops over the same cases. A c
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
@@ -113,13 +114,15 @@ class Refused:
 class Case:
     """Calls and what is demanded of their results, in this order.
 
-    refused: of a case with one call and no other demand. keeps: the calls leave their arguments as they were.
+    refused: of a case with one call and no other demand. keeps: the calls leave their arguments as they were. by_hand:
+    an example of a chapter, with numbers that can be followed by hand.
     """
 
     calls: tuple[Call, ...]
     demands: tuple[Equal | Related, ...] = ()
     refused: Refused | None = None
     keeps: bool = False
+    by_hand: bool = False
 
     @property
     def functions(self) -> frozenset[str]:
@@ -127,7 +130,7 @@ class Case:
         pulled = {str(call.arguments[0]) for call in self.calls if call.function == "vjp"}
         return frozenset(call.function for call in self.calls) | pulled
 
-    @property
+    @functools.cached_property
     def is_extreme(self) -> bool:
         """Whether it is about input that is refused, not finite, tiny or huge."""
         return self.refused is not None or any(is_extreme(call.arguments) for call in self.calls)

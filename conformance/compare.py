@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from conformance.case import Call
+    from conformance.case import Call, Case
 
 DTYPES = ("float64", "float32", "bfloat16")
 EPSILON = {"float64": 2.0**-52, "float32": 2.0**-23, "bfloat16": 2.0**-7}
@@ -61,7 +61,8 @@ class Comparisons:
     """Compares results in one precision, and remembers the worst.
 
     `compared` counts numbers compared, so that a check that compares nothing can be told from one that passes. `call`
-    is the last one that was made, whose results are compared.
+    is the last one that was made, whose results are compared; `case` is the one that it belongs to, None in a script,
+    and `drawn` whether hypothesis draws values there.
     """
 
     def __init__(self, dtype: str) -> None:
@@ -70,6 +71,8 @@ class Comparisons:
         self.compared = 0
         self.call: Call | None = None
         self.left_out: list[str] = []
+        self.case: Case | None = None
+        self.drawn = False
 
     def compare(
         self,

@@ -4,7 +4,6 @@ import contextlib
 import dataclasses
 import functools
 import math
-import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
@@ -17,7 +16,7 @@ from conformance.case import Case, Cases, Drawn, Setting
 from conformance.compare import Deviation, entries
 from conformance.strategies import ordinary_numbers
 
-SHRINKING = 2.0  # seconds in which hypothesis may look for a smaller case that deviates
+SHRINKING = 50  # examples that hypothesis may try to find a smaller one that deviates
 DRAW_BYTES = 8192
 IN_VAIN = 100  # draws in a row that give no example, or one that is there already, until there are no others
 
@@ -41,16 +40,20 @@ def cases(
 
     ordinary: those alone that have no extreme input.
     """
-    found: list[tuple[Case, Example | None]] = []
-    drawn = 0
     with ordinary_numbers(ordinary), np.errstate(all="ignore"):
-        for item in build(setting):
-            if isinstance(item, Case):
-                found.append((item, None))
-            else:
-                found += draw(item, setting, drawn)
-                drawn += 1
+        found = tuple(one_by_one(build, setting))
     return tuple((case, example) for case, example in found if not (ordinary and case.is_extreme))
+
+
+def one_by_one(build: Callable[[Setting], Cases], setting: Setting) -> Iterator[tuple[Case, Example | None]]:
+    """The same, each when it is asked for."""
+    drawn = 0
+    for item in build(setting):
+        if isinstance(item, Case):
+            yield item, None
+        else:
+            yield from draw(item, setting, drawn)
+            drawn += 1
 
 
 def draw(drawn: Drawn, setting: Setting, number: int) -> Iterator[tuple[Case, Example]]:
@@ -133,26 +136,28 @@ def _test(strategies: Strategies, body: Callable[..., None], setting: Setting) -
 
 
 class _Enough(BaseException):
-    """No more time for smaller cases. Not an Exception: hypothesis would take it for another way to fail."""
+    """Smaller cases were looked for long enough. Not an Exception: hypothesis would take it for another way to fail."""
 
 
 class _Shrinking:
-    """Runs a function on drawn values, and finds smaller ones that fail for some seconds after the first."""
+    """Runs a function on drawn values; ends the search for smaller ones that fail after a number of attempts, which no
+    clock decides: the same input is found on every machine."""
 
     def __init__(self, body: Callable[..., None]) -> None:
         self._body = body
-        self._since, self._size = math.inf, math.inf
+        self._left, self._size = SHRINKING, math.inf
         self._smallest: dict[str, Any] = {}
 
     def run(self, **values: Any) -> None:
-        if time.monotonic() - self._since > SHRINKING:
+        if self._smallest:
+            self._left -= 1
+        if self._left < 0:
             raise _Enough
         try:
             self._body(**values)
         except hypothesis.errors.UnsatisfiedAssumption:
             raise
         except Exception:
-            self._since = min(self._since, time.monotonic())
             if (size := _count(values)) <= self._size:
                 self._size, self._smallest = size, values
             raise

@@ -18,9 +18,8 @@ from conformance.adapter import OBJECTS
 from conformance.adapters.numpy_adapter import NumpyAdapter
 from conformance.case import Call, Equal, Refused, Setting
 from conformance.check import CHECKS, Check
-from conformance.compare import WIDE, Comparisons, Unjudged, Worst, is_extreme, round_to
+from conformance.compare import WIDE, Comparisons, Unjudged, Worst, round_to
 from conformance.diagnosis import AGREEMENT, DERIVATIVES, VALUES
-from conformance.drawing import cases
 from conformance.execute import FAILING, CheckOptions, Result, missing, not_offered, outcome, run, run_check
 from conformance.judge import Ask, asking, copied, judge_refusal, standing_in
 from conformance.mutants import MUTANTS, Mutant, MutantAdapter
@@ -60,7 +59,7 @@ def telling_checks(checks: Iterable[Check]) -> list[Check]:
     """Those by which editions can be told apart: of a requirement that an edition has otherwise, by a mutant or by a
     setting.
 
-    Gradients are left out: they are slow, and tell nothing that the losses do not.
+    Gradients and large batches are left out: they are slow, and tell nothing that the losses of small ones do not.
     """
     told = {
         name
@@ -68,7 +67,11 @@ def telling_checks(checks: Iterable[Check]) -> list[Check]:
         for name, difference in edition.differs.items()
         if difference.is_modelled
     }
-    return [check for check in checks if not told.isdisjoint(check.requirements) and GRADIENTS.isdisjoint(check.uses)]
+    return [
+        check
+        for check in checks
+        if not told.isdisjoint(check.requirements) and GRADIENTS.isdisjoint(check.uses) and not check.is_large
+    ]
 
 
 def judge(
@@ -99,22 +102,20 @@ def judge(
 def judge_twice(
     check: Check, adapter: object, edition: Edition, dtype: str, seed: int = 0, examples: int = 25
 ) -> Result:
-    """`judge`; where the check fails, it is run again to see whether it fails with ordinary input, too."""
-    result = judge(check, adapter, edition, dtype, seed, examples)
-    if result.status not in FAILING:
+    """`judge`; where the check fails, the result is that of the most ordinary input that it fails with.
+
+    It is run again where a more ordinary input than the first that fails may fail too.
+    """
+    how = (check, adapter, edition, dtype, seed)
+    result = judge(*how, examples, shrink=False)
+    if result.status not in FAILING or (result.call is not None and result.call.is_most_ordinary):
         return result
-    if _asks_nothing_ordinary(result.check, Setting(dtype, edition.profile, seed, AGAIN * examples)):
-        return dataclasses.replace(result, extreme=True)
-    again = judge(check, adapter, edition, dtype, seed, AGAIN * examples, shrink=False, ordinary=True)
-    return dataclasses.replace(result, extreme=again.status == "pass")
-
-
-def _asks_nothing_ordinary(check: Check, setting: Setting) -> bool:
-    """Whether every call of a check has extreme input or is to be refused."""
-    if check.cases is None:
-        return False
-    found = [case for case, _ in cases(check.cases, setting)]
-    return all(case.refused is not None or all(is_extreme(call.arguments) for call in case.calls) for case in found)
+    again = judge(*how, AGAIN * examples, ordinary=True)
+    if again.status in FAILING and again.call is not None:
+        return again
+    smaller = judge(*how, examples) if result.call is None or result.call.case is None or result.call.drawn else result
+    extreme = again.status == "pass" or (result.call is not None and result.call.is_extreme_throughout)
+    return dataclasses.replace(smaller if smaller.status in FAILING else result, extreme=extreme)
 
 
 def by_comparison(result: Result, edition: Edition, asked: CheckOptions) -> bool:
@@ -183,7 +184,13 @@ def _compared(
         ask = standing_in(ask, MutantAdapter(mutant))
     unjudged = Unjudged(setting.dtype)
     unjudged.left_out = comparisons.left_out
-    body = functools.partial(run, check, setting, ask, unjudged, adapter, shrink, ordinary)
+
+    def body() -> None:
+        try:
+            run(check, setting, ask, unjudged, adapter, shrink, ordinary)
+        finally:
+            comparisons.case, comparisons.drawn = unjudged.case, unjudged.drawn
+
     return outcome(check, adapter, comparisons, body)
 
 
@@ -253,6 +260,17 @@ def fit(checks: Iterable[Check], adapter: object, dtype: str, seed: int = 0, exa
             statuses[check.name] = NOT_JUDGED if status == "not offered" else status
             broken |= status == "error"
     return [Fit(name, statuses) for name, statuses in found.items()]
+
+
+def may_fit_better(failing: Iterable[Check], adapter: object, chosen: Edition, dtype: str, seed: int = 0) -> bool:
+    """Whether one of the checks that fail in the chosen edition passes in another with ordinary input: where none does,
+    no edition can fit better."""
+    others = [edition for name, edition in editions().items() if name != chosen.name]
+    return any(
+        judge(check, adapter, edition, dtype, seed, FIT_EXAMPLES, shrink=False, ordinary=True).status == "pass"
+        for check in failing
+        for edition in others
+    )
 
 
 def best(fits: Iterable[Fit]) -> Fit:

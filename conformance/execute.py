@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from conformance.adapters.numpy_adapter import NumpyAdapter
-from conformance.case import Call, Setting
+from conformance.case import Case, Setting
 from conformance.check import CHECKS, Check
-from conformance.compare import CandidateLost, Comparisons, Deviation, Worst
+from conformance.compare import CandidateLost, Comparisons, Deviation, Worst, is_extreme
 from conformance.drawing import cases
-from conformance.judge import Ask, asking, judge_cases, standing_in
+from conformance.judge import Ask, asking, judge_cases, judge_ordinary_cases, standing_in
 from conformance.requirements import requirements
 from conformance.script import Script
 from conformance.strategies import ordinary_numbers
@@ -30,7 +30,8 @@ class FailedCall:
     """The call where a check failed, and the comparison that went wrong.
 
     got and expected: the two arrays that disagree, None where no arrays were compared. index: of the worst element,
-    None where shapes differ.
+    None where shapes differ. case: that the call belongs to, None in a script; drawn: whether hypothesis draws values
+    there.
     """
 
     function: str
@@ -38,6 +39,24 @@ class FailedCall:
     got: np.ndarray | None = None
     expected: np.ndarray | None = None
     index: tuple[int, ...] | None = None
+    case: Case | None = None
+    drawn: bool = False
+
+    @property
+    def by_hand(self) -> bool:
+        """Whether it is an example of a chapter."""
+        return self.case is not None and self.case.by_hand
+
+    @property
+    def is_most_ordinary(self) -> bool:
+        """Whether no input can be more ordinary: it is written down, and not extreme."""
+        return self.case is not None and not self.drawn and not self.case.is_extreme
+
+    @property
+    def is_extreme_throughout(self) -> bool:
+        """Whether no call of its case has ordinary input."""
+        case = self.case
+        return case is not None and (case.refused is not None or all(is_extreme(call.arguments) for call in case.calls))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -123,7 +142,8 @@ def not_implemented(check: Check, function: str, reason: str) -> Result:
 def run_check(check: Check, adapter: object, setting: Setting, shrink: bool = True, ordinary: bool = False) -> Result:
     """Runs one check; what the candidate raises becomes a result.
 
-    shrink: makes values smaller that deviate, which takes longer. ordinary: deviations with extreme input do not count.
+    shrink: makes values smaller that deviate, which takes longer. ordinary: deviations with extreme input do not count;
+    with `shrink`, cases are built one by one, which is faster where one of the first deviates.
     """
     if lacking := missing(adapter, check):
         return not_offered(check, lacking)
@@ -146,7 +166,9 @@ def run(
     """Runs a check to its end or to its first deviation, which is raised. adapter: the candidate that `ask` asks."""
     any_error = bool(getattr(adapter, "refuses_anyhow", False))
     with np.errstate(all="ignore"), ordinary_numbers(ordinary):
-        if check.cases is not None:
+        if check.cases is not None and ordinary and shrink:
+            judge_ordinary_cases(check.cases, setting, ask, comparisons, any_error)
+        elif check.cases is not None:
             judge_cases(check.cases, setting, ask, comparisons, ordinary=ordinary, shrink=shrink, any_error=any_error)
         else:
             assert check.script is not None
@@ -157,7 +179,7 @@ def outcome(check: Check, adapter: object, comparisons: Comparisons, body: Calla
     """What came of running a check."""
 
     def result(status: str, worst: Worst, message: str, deviation: Deviation | None = None) -> Result:
-        return Result(check, status, worst, comparisons.compared, message, _failed(comparisons.call, deviation))
+        return Result(check, status, worst, comparisons.compared, message, _failed(comparisons, deviation))
 
     broken = Worst(math.inf, math.inf, check.name)
     try:
@@ -180,11 +202,11 @@ def outcome(check: Check, adapter: object, comparisons: Comparisons, body: Calla
     return Result(check, "pass", comparisons.worst, comparisons.compared, lacking)
 
 
-def _failed(call: Call | None, deviation: Deviation | None) -> FailedCall | None:
-    if call is None:
+def _failed(comparisons: Comparisons, deviation: Deviation | None) -> FailedCall | None:
+    if (call := comparisons.call) is None:
         return None
     arrays = (deviation.got, deviation.expected, deviation.index) if deviation is not None else (None, None, None)
-    return FailedCall(call.function, call.arguments, *arrays)
+    return FailedCall(call.function, call.arguments, *arrays, comparisons.case, comparisons.drawn)
 
 
 def selected_checks(dtype: str, only: str = "") -> list[Check]:

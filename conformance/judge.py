@@ -7,7 +7,7 @@ import numpy as np
 
 from conformance.case import Call, Case, Equal, Refused, Setting
 from conformance.compare import Comparisons, is_extreme
-from conformance.drawing import cases, smallest
+from conformance.drawing import Example, cases, one_by_one, smallest
 
 COPIED = 2**16  # numbers of an array up to which arguments are kept as they were
 
@@ -41,27 +41,60 @@ def judge_cases(
     shrink: bool = True,
     any_error: bool = False,
 ) -> None:
-    """Judges the cases of a check in their order, up to the first deviation.
+    """Judges the cases of a check up to the first deviation, the most ordinary first: examples of the chapter, others
+    that are written down, drawn ones, and those with extreme input.
 
-    ordinary: leaves those out that have extreme input. shrink: makes drawn values smaller that deviate, which takes
-    longer. any_error: a candidate that is somebody else's program may refuse with any exception, and may say of some
-    cases that it lacks what they ask for: the others count.
+    ordinary: leaves the last out. shrink: makes drawn values smaller that deviate, which takes longer. any_error: a
+    candidate that is somebody else's program may refuse with any exception, and may say of some cases that it lacks
+    what they ask for: the others count.
     """
-    for case, example in cases(build, setting, ordinary):
-        try:
-            judge_case(case, ask, comparisons, any_error)
-        except NotImplementedError as error:
-            if not any_error:
-                raise
-            comparisons.left_out.append(f"{case.calls[0].function} ({error})")
-        except Exception:
-            if example is not None and shrink and not ordinary:
-                smallest(example, setting, lambda case: judge_case(case, ask, comparisons, any_error))
+    for case, example in sorted(cases(build, setting, ordinary), key=_how_special):
+        comparisons.drawn = example is not None
+        _judge(case, example if shrink else None, setting, ask, comparisons, any_error)
+
+
+def judge_ordinary_cases(
+    build: Callable[[Setting], Any], setting: Setting, ask: Ask, comparisons: Comparisons, any_error: bool = False
+) -> None:
+    """Judges the ordinary cases of a check in their order, each as soon as it is built: for many cases of which one of
+    the first will deviate. Drawn values that deviate are made smaller. Call it within `ordinary_numbers`."""
+    for case, example in one_by_one(build, setting):
+        comparisons.drawn = example is not None
+        if not case.is_extreme:
+            _judge(case, example, setting, ask, comparisons, any_error)
+
+
+def _how_special(item: tuple[Case, Example | None]) -> tuple[bool, bool, bool]:
+    case, example = item
+    return case.is_extreme, example is not None, not case.by_hand
+
+
+def _judge(
+    case: Case, example: Example | None, setting: Setting, ask: Ask, comparisons: Comparisons, any_error: bool
+) -> None:
+    """Judges a case. One that deviates gives way to those of a smaller example, as ordinary, where it is of one."""
+    try:
+        judge_case(case, ask, comparisons, any_error)
+    except NotImplementedError as error:
+        if not any_error:
             raise
+        function = comparisons.call.function if comparisons.call else case.calls[0].function
+        comparisons.left_out.append(function + (f" ({error})" if str(error) else ""))
+    except Exception:
+        if example is not None:
+            any_case = case.is_extreme
+
+            def judge_again(case: Case) -> None:
+                if any_case or not case.is_extreme:
+                    judge_case(case, ask, comparisons, any_error)
+
+            smallest(example, setting, judge_again)
+        raise
 
 
 def judge_case(case: Case, ask: Ask, comparisons: Comparisons, any_error: bool = False) -> None:
     """Raises `Deviation` unless all demands are met, or what the candidate raises."""
+    comparisons.case = case
     if case.refused is not None:
         judge_refusal(case.calls[0], case.refused, ask, comparisons, any_error)
         return

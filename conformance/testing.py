@@ -149,10 +149,12 @@ class _SharedAdapter:
 def _told(result: Result, asked: CheckOptions) -> str:
     """A failure as `conformance check` prints it, with the chapters to read."""
     data = terminal.printable(check_data(result, asked))
+    texts = {name: requirements()[name] for name in result.check.requirements if name in requirements()}
     paths = dict.fromkeys(map(chapter_of, result.check.requirements))
     return "\n".join(
         [
             f"{result.check.name} ({', '.join(data['requirements'])}): {data['summary']}",
+            *(f"  {sentence}" for sentence in summary.sentences(texts)),
             f"see {', '.join(f'{summary.title(path)} ({path})' for path in paths)}",
             *(["only with extreme input; with ordinary input it passes"] if result.extreme else []),
             terminal.details(data),

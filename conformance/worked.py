@@ -85,7 +85,8 @@ def worked_cases(setting: Setting, chapter: str, *names: str, floor: float = 0.0
         expected = getattr(_reference(), case.function)(*copy.deepcopy(arguments))
         where = f"{case.function}, {case.name.partition(': ')[2]}"
         magnitude = _combine(lambda value: np.maximum(np.abs(value), floor), expected) if bound else 1.0
-        yield equal(case.function, arguments, expected, where=where, magnitude=magnitude, bound=bound)
+        made = equal(case.function, arguments, expected, where=where, magnitude=magnitude, bound=bound)
+        yield dataclasses.replace(made, by_hand=True)
 
 
 def _held(setting: Setting, name: str, value: Any) -> Any:

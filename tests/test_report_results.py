@@ -246,7 +246,7 @@ def test_a_process_and_an_object_have_snippets() -> None:
     asked = settings(candidate="./their server", process=True)
     assert "ProcessAdapter('./their server', 'float64'" in snippet(PASS, FailedCall("symlog", (np.ones(2),)), asked)
     made = snippet("replay.any", FailedCall("Replay", (10, 2)), settings())
-    assert "judge(CHECKS['replay.any'], adapter, find_edition('paper'), 'float64', seed=3, examples=5)" in made
+    assert "judge_twice(CHECKS['replay.any'], adapter, find_edition('paper'), 'float64', seed=3, examples=5)" in made
     assert "adapter.Replay" not in made
     compile(made, "snippet", "exec")
 

@@ -11,7 +11,7 @@ from conformance.candidate import candidate, remarks
 from conformance.check import Check
 from conformance.compare import DTYPES
 from conformance.diagnosis import diagnose
-from conformance.editions import Fit, best, by_comparison, fit, judge_twice, telling_checks, to_json
+from conformance.editions import Fit, best, by_comparison, fit, judge_twice, may_fit_better, telling_checks, to_json
 from conformance.errors import UserError
 from conformance.execute import FAILING, CheckOptions, Result, calls_of, selected_checks
 from conformance.expected import ExpectedFailures, read_expected
@@ -99,8 +99,9 @@ def main(console: Console, options: argparse.Namespace) -> int:
             **{name: getattr(options, name) for name in ("dtype", "device", "only", "seed", "examples", "at_least")},
         )
         results = list(_run_all(progress, checks, adapter, asked))
-        if named and telling_checks(
-            result.check for result in results if result.status in FAILING and not result.extreme
+        failing = telling_checks(result.check for result in results if result.status in FAILING and not result.extreme)
+        if named and may_fit_better(
+            progress.over("editions", failing), adapter, editions()[named], asked.dtype, asked.seed
         ):
             fits = _fit(progress, checks, adapter, options)
         diagnoses = None if options.no_diagnosis else _diagnoses(progress, adapter, results, asked)

@@ -40,7 +40,7 @@ def _environment(package: str) -> Environment:
 
 def prose(text: str) -> Markup:
     """A line of Markdown: code, bold and italics, links as their words, and formulas as plain text."""
-    text = re.sub(r"\[([^\]]+)\]\([^)]*\)", r"\1", tex.plain(text))
+    text = tex.plain(text)
     parts, end = [], 0
     for found in _INLINE.finditer(text):
         tag = found.lastgroup or ""

@@ -14,7 +14,8 @@ LOWERED = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
 
 
 def plain(text: str) -> str:
-    """A text with each $formula$ in Unicode. What stands in `code` stays as it is."""
+    """A text with each $formula$ in Unicode and each link as its words. What stands in `code` stays as it is."""
+    text = re.sub(r"\[([^\]]+)\]\([^)]*\)", r"\1", text)
     return re.sub(r"(`[^`]*`)|\$([^$]+)\$", lambda found: found[1] or _formula(found[2]), text)
 
 

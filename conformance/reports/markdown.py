@@ -16,8 +16,8 @@ def render(data: Data) -> str:
         _chapters(data),
         *_diagnoses(data),
         *_requirements(data),
-        *_failures("Failures", summary.failures(data).ordinary),
-        *_failures("Only with extreme input", summary.failures(data).extreme),
+        *_failures(data, "Failures", summary.failures(data).ordinary),
+        *_failures(data, "Only with extreme input", summary.failures(data).extreme),
         *_expected(data),
     ]
     return "\n\n".join(parts) + "\n"
@@ -25,7 +25,16 @@ def render(data: Data) -> str:
 
 def text(plain: str) -> str:
     """Plain text in which nothing is markup, in one line."""
-    return re.sub(r"([\\`*_{}\[\]<>|#!~$&])", r"\\\1", " ".join(plain.split()))
+    return _escaped(" ".join(plain.split()))
+
+
+def _escaped(plain: str) -> str:
+    return re.sub(r"([\\`*_{}\[\]<>|#!~$&])", r"\\\1", plain)
+
+
+def sentence(line: str) -> str:
+    """A sentence of a chapter. Only what stands in `code` is markup."""
+    return "".join(part if part.startswith("`") else _escaped(part) for part in re.split(r"(`[^`]+`)", line))
 
 
 def code(plain: str) -> str:
@@ -95,20 +104,22 @@ def _expected(data: Data) -> list[str]:
     rows = [[code(entry["name"]), entry["outcome"], text(entry["reason"])] for entry in data["expected_failures"]]
     if not rows:
         return []
-    failing = (part for name, check in summary.failures(data).expected for part in _failure(name, check))
+    failing = (part for name, check in summary.failures(data).expected for part in _failure(data, name, check))
     return ["## Expected failures", table(["name", "outcome", "reason"], rows), *failing]
 
 
-def _failures(title: str, failing: Sequence[tuple[str, Data]]) -> list[str]:
-    return [f"## {title}", *(part for name, check in failing for part in _failure(name, check))] if failing else []
+def _failures(data: Data, title: str, failing: Sequence[tuple[str, Data]]) -> list[str]:
+    parts = [part for name, check in failing for part in _failure(data, name, check)]
+    return [f"## {title}", *parts] if parts else []
 
 
-def _failure(name: str, check: Data) -> list[str]:
+def _failure(data: Data, name: str, check: Data) -> list[str]:
     failure = check["failure"]
     expected = f" An expected failure: {text(check['expected_failure'])}" if summary.is_expected(check) else ""
     parts = [
         f"### {text(name)}",
         f"{', '.join(check['requirements'])}: {text(check['summary'])}{expected}",
+        *(f"> {sentence(line)}" for line in summary.demands(data, check)),
         block(check["message"], "text"),
     ]
     rows = [

@@ -11,7 +11,8 @@ from conformance.reports.values import WRITTEN_OUT, is_known, shown, size, sourc
 def failure(result: Result, options: CheckOptions) -> dict[str, Any]:
     """The failing call in full as far as it is small, and how to repeat it; as the schema's `failure` says.
 
-    The call is the last one before the deviation: it has the smallest arguments that hypothesis finds.
+    The call is the last one before the deviation, with the most ordinary input that deviates: an example of a chapter,
+    or else what is written down, or the smallest arguments that hypothesis finds.
     """
     call = result.call
     found: dict[str, Any] = {"function": None, "arguments": [], "got": None, "expected": None}
@@ -31,6 +32,7 @@ def failure(result: Result, options: CheckOptions) -> dict[str, Any]:
             )
     return {
         **found,
+        "by_hand": call is not None and call.by_hand,
         "command": command(result.check.name, options),
         "snippet": snippet(result.check.name, call, options),
     }
@@ -85,11 +87,11 @@ def snippet(name: str, call: FailedCall | None, options: CheckOptions) -> str:
         "import conformance.cases",
         adapter[0],
         "from conformance.check import CHECKS",
-        "from conformance.editions import judge",
+        "from conformance.editions import judge_twice",
         "from spec import find_edition",
         "",
     ]
-    lines += [adapter[1], f"result = judge(CHECKS[{name!r}], adapter, {how})", "print(result.message)"]
+    lines += [adapter[1], f"result = judge_twice(CHECKS[{name!r}], adapter, {how})", "print(result.message)"]
     if call is not None and call.function not in OBJECTS:
         lines += [f"print(adapter.{call.function}(*result.call.arguments))"]
         lines += ["print(result.call.expected)"] if call.expected is not None else []

@@ -10,6 +10,7 @@ from importlib import resources
 from typing import Any
 
 from conformance.execute import NOT_IMPLEMENTED
+from conformance.pages import tex
 from conformance.requirements import check_label
 from spec import editions
 
@@ -21,6 +22,7 @@ STATUSES = ("pass", "fail", "error", EXTREME, "expected failure", "partly offere
 """As told: a failure may be only with extreme input, or expected; of a requirement, some checks may be offered and
 others not."""
 NAMED = 3  # checks that a line names
+SENTENCES = 3  # requirements of a check that are told in full
 UNMEASURED = "not measurable"
 SCALE = (
     "The worst deviation, as a share of the allowed one: 100% is the limit, and 20× is twenty times as much. "
@@ -31,8 +33,8 @@ SCALE = (
 
 @dataclasses.dataclass(frozen=True)
 class Failures:
-    """The checks that failed, by name. extreme: only with extreme input. Those that a recognized mistake explains come
-    first in each."""
+    """The checks that failed, by name. extreme: only with extreme input. In each, those come first that a recognized
+    mistake explains, and of these those with numbers that can be followed by hand."""
 
     ordinary: list[tuple[str, Data]]
     extreme: list[tuple[str, Data]]
@@ -122,7 +124,7 @@ def is_expected(check: Data) -> bool:
 
 def failures(data: Data) -> Failures:
     failing = [(name, check) for name, check in data["checks"].items() if check["status"] in FAILING]
-    failing.sort(key=lambda item: not matching(data, item[0]))
+    failing.sort(key=lambda item: (not matching(data, item[0]), not item[1]["failure"].get("by_hand")))
     unexpected = [item for item in failing if not is_expected(item[1])]
     return Failures(
         ordinary=[item for item in unexpected if not item[1]["extreme"]],
@@ -274,6 +276,18 @@ def chapters_of(data: Data, check: Data) -> list[str]:
     """The paths of the chapters whose requirements a check covers."""
     known = data["requirements"]
     return sorted({known[name]["chapter"] for name in check["requirements"] if name in known})
+
+
+def demands(data: Data, check: Data) -> list[str]:
+    """`sentences` of the requirements of a check, as the result has them."""
+    known = data["requirements"]
+    return sentences({name: known[name]["text"] for name in check["requirements"] if name in known})
+
+
+def sentences(texts: Mapping[str, str]) -> list[str]:
+    """What requirements say, by their ids, in Markdown without links and formulas: of many, the first few."""
+    found = [f"{name}: {tex.plain(text)}" for name, text in texts.items()]
+    return found[:SENTENCES] + [f"and {len(found) - SENTENCES} more"] * (len(found) > SENTENCES)
 
 
 def checks_of(data: Data, requirement: str, statuses: Collection[str] = STATUSES) -> list[str]:

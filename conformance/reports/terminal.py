@@ -32,10 +32,10 @@ def show(console: Console, data: Data) -> None:
     for diagnosis in summary.diagnoses(data):
         _diagnosis(console, diagnosis)
     failures = summary.failures(data)
-    _failures(console, failures.ordinary, SHOWN)
+    _failures(console, data, failures.ordinary, SHOWN)
     if failures.extreme:
         console.print("\n[bold]Only with extreme input[/]", highlight=False)
-        _failures(console, failures.extreme, max(0, SHOWN - len(failures.ordinary)))
+        _failures(console, data, failures.extreme, max(0, SHOWN - len(failures.ordinary)))
     for entry in data["expected_failures"]:
         outcome = {"fail": "fails as expected", "pass": "passes, and is expected to fail", "not run": "was not run"}[
             entry["outcome"]
@@ -92,13 +92,14 @@ def _diagnosis(console: Console, diagnosis: Data) -> None:
         _plain(console, f"  cannot be told from {', '.join(diagnosis['alternatives'])}")
 
 
-def _failures(console: Console, failing: Sequence[tuple[str, Data]], shown: int) -> None:
+def _failures(console: Console, data: Data, failing: Sequence[tuple[str, Data]], shown: int) -> None:
     """Some in full, the others by name."""
     for name, check in failing[:shown]:
         console.print(
             f"\n[bold red]{name}[/] ({', '.join(check['requirements'])}): {escape(check['summary'])}", highlight=False
         )
-        _plain(console, details(check))
+        for line in [*(f"  {sentence}" for sentence in summary.demands(data, check)), details(check)]:
+            _plain(console, line)
         console.print(f"  {check['failure']['command']}", markup=False, highlight=False, soft_wrap=True)
     if len(failing) > shown:
         number = f"and {len(failing) - shown} more" if shown else f"{len(failing)}"
