@@ -47,6 +47,7 @@ def test_a_right_backend_passes(dtype: str) -> None:
     assert {"encoder", "core", "critic"} <= named.keys()
     assert ("losses" in named) is ("gradient along all parameters" in named) is (dtype != "bfloat16")
     assert all(one.requirements and 0 <= one.share <= 1 for one in report.comparisons)
+    assert any(name.startswith("gradient of every tensor") for name in named) is (dtype == "bfloat16")
     assert {"NET-2", "NET-12"} <= set(named["encoder"].requirements)
     assert len({one.share for one in report.comparisons}) > 5, "each has a share of its own"
     reference = preflight("numpy", SPACES, config(dtype))
@@ -83,6 +84,18 @@ def test_a_gradient_that_is_missing_is_seen(start: str, dtype: str) -> None:
     assert not report.passed
     assert "gradient along" in report.summary
     assert report.comparisons[-1].name.startswith(("total loss", "gradient along"))
+
+
+@pytest.mark.parametrize("factor", [0.0, 0.5, 2.0, -1.0, np.nan])
+@pytest.mark.parametrize("tensor", ["encoder/image/conv0/kernel", "rssm/gru/bias", "critic/hidden0/scale"])
+def test_a_gradient_that_is_wrong_in_bfloat16_is_seen(tensor: str, factor: float) -> None:
+    def wrong(gradients: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        return {**gradients, tensor: factor * gradients[tensor]}
+
+    wide = load_adapter("torch", "float32")
+    report = preflight_adapter(ChangedGradients("bfloat16", wrong), SPACES, config("bfloat16"), wide=wide)
+    assert not report.passed
+    assert report.summary.startswith(f"gradient: gradient of {tensor}")
 
 
 def test_a_gradient_that_is_not_finite_is_seen() -> None:
