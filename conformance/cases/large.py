@@ -23,14 +23,16 @@ from conformance.cases.agent import (
     problem_of,
 )
 from conformance.cases.losses import demands_of
-from conformance.check import check
+from conformance.check import check, script
 from conformance.compare import Comparisons
 from conformance.problems import Problem, make_problem, problem_in
+from conformance.script import Script
 from conformance.settled import settled
-from reference_numpy import optimizer
+from reference_numpy import networks, optimizer
 from spec import Discrete, Image, Spaces, Vector
 
 RUN = {"batch_size": 17, "batch_length": 61, "imagination_horizon": 15}
+HALF = RUN["batch_length"] // 2
 EQUAL = dict.fromkeys(("batch_size", "batch_length", "imagination_horizon", "stoch", "classes", "blocks"), 4)
 EQUAL_SPACES = Spaces(
     {"image": Image(16, 16, 4), "mode": Discrete((4, 4)), "position": Vector(4)}, {"action": Discrete((4,))}
@@ -94,6 +96,25 @@ def gradient_of_a_batch_is_that_of_its_rows(setting: Setting) -> Cases:
         gradient_along(c, example, whole, ["all", "all, again"], bound_of(setting, 1e-5, 5e-3))
 
     yield related(mean_of_rows, *(("gradients", one.loss_arguments) for one in (problem, *rows)))
+
+
+@script("RSSM-13", "RSSM-17", "RSSM-19", "CON-12", uses=["observe"], level=2, dtypes=WHOLE)
+def a_sequence_is_its_halves(script: Script) -> None:
+    """States and logits of 61 steps are those of 30 and, from the last of their states, of 31."""
+    problem = batch_of_a_run(script.setting).problem
+    params, batch, bound = problem.state["params"], problem.batch, bound_of(script.setting, 1e-9, 1e-4)
+    tokens = networks.encoder(params, batch, problem.spaces, problem.config)
+    steps = (tokens, batch["prev_action"], batch["is_first"], problem.noise["posterior"])
+    start = {"deter": batch["deter"], "stoch": np.eye(problem.config.classes)[batch["stoch"]]}
+
+    def observed(carry: Mapping[str, Any], part: slice) -> Any:
+        return script.call("observe", params, carry, *(x[:, part] for x in steps), problem.config)
+
+    whole, first = observed(start, slice(None)), observed(start, slice(HALF))
+    second = observed({name: np.asarray(first[name])[:, -1] for name in start}, slice(HALF, None))
+    for name in ("deter", "stoch", "logits"):
+        halves = np.concatenate([np.asarray(part[name]) for part in (first, second)], 1)
+        script.compare(f"{name} of the whole", whole[name], halves, magnitude="tensor", bound=bound)
 
 
 @check("AGT-15", "AGT-26", "RET-11", "RET-14", "CON-20", uses=["losses"], level=2, dtypes=WHOLE)
