@@ -18,7 +18,7 @@ from collections.abc import Callable
 import numpy as np
 
 FALSE_ALARMS = 1e-6
-CHECKS = 5
+CHECKS = 6
 """How many checks of a run are statistical."""
 
 

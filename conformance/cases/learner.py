@@ -15,7 +15,15 @@ from conformance.cases.agent import (
     bound_of,
     loss_magnitude,
 )
-from conformance.cases.sampling import compare_distribution, compare_groups, require_shape, signs, tests_of
+from conformance.cases.sampling import (
+    compare_distribution,
+    compare_groups,
+    compare_parameters,
+    drawn_config,
+    require_shape,
+    signs,
+    tests_of,
+)
 from conformance.check import script
 from conformance.compare import part_of
 from conformance.problems import Problem, make_problem, random_observations, random_state, spaces, with_sampling_margin
@@ -136,8 +144,8 @@ def compare_acting(script: Script, learner: Any, problem: Problem, seed: int, wh
 
 @script("AGT-7", "AGT-8", "AGT-29", "AGT-30", "CON-20", uses=["Learner", "gradients"], level=3, dtypes=WHOLE)
 def train_steps_match(script: Script) -> None:
-    """Two train steps from a fresh state, whose moments are zero, and one from the middle of training; each with the
-    learner's own noise, and after each the whole state."""
+    """Two train steps from a fresh state, whose moments are zero, and one of another learner with other options from
+    the middle of training; each with the learner's own noise, and after each the whole state."""
     problem = small_problem(script)
     learner = made(script, problem)
     fresh = state_of(learner, problem)
@@ -146,14 +154,26 @@ def train_steps_match(script: Script) -> None:
     seed = compare_step(script, learner, problem, 1, "first train step", config)
     compare_step(script, learner, problem, seed + 1, "second train step", config)
     rng = np.random.default_rng(script.setting.seed)
+    options: dict[str, Any] = {"learning_rate": 3e-3, "beta1": 0.8, "agc_clip": 0.1}
+    other = dataclasses.replace(problem, config=dataclasses.replace(problem.config, **options))
+    learner = made(script, other)
     learner.load_state_dict(
-        reference.flatten_state(random_state(rng, problem.config, problem.spaces, script.setting.dtype))
+        reference.flatten_state(random_state(rng, other.config, other.spaces, script.setting.dtype))
     )
-    compare_step(script, learner, problem, seed + SEEDS, "train step from the middle", config)
+    compare_step(script, learner, other, seed + SEEDS, "train step from the middle", config)
 
 
 def fresh_like(state: dict[str, Any]) -> dict[str, Any]:
     return reference.initial_state(state["params"])
+
+
+@script("AGT-3", "AGT-4", "AGT-5", "AGT-6", "LAY-9", "LAY-10", uses=["Learner"], level=3, dtypes=WHOLE)
+def fresh_parameters_have_their_distribution(script: Script) -> None:
+    """Those that a learner begins with: names, shapes, zeros, ones and kernels that are drawn, each for itself."""
+    task, config = spaces(), drawn_config(script)
+    learner = script.call("Learner", task, config, script.setting.seed)
+    state = reference.unflatten_state(learner.state_dict(), parameter_table(config, task))
+    compare_parameters(script, task, config, state["params"])
 
 
 @script("AGT-11", "LOOP-18", "BEH-8", uses=["Learner"], level=3, dtypes=WHOLE)
@@ -167,6 +187,19 @@ def acting_uses_the_newest_parameters(script: Script) -> None:
     compare_acting(script, learner, problem, 20, "loaded")
     learner.train_step(problem.batch, 1)
     compare_acting(script, learner, problem, 30, "trained")
+
+
+@script("AGT-13", "RSSM-13", uses=["Learner"], level=3)
+def acting_leaves_its_carry_as_it_was(script: Script) -> None:
+    """A step that resets a row of a carry changes nothing of what another step makes of the same carry."""
+    problem = small_problem(script)
+    learner = made(script, problem)
+    observations = [random_observations(np.random.default_rng(seed), problem.spaces, (ROWS,)) for seed in (1, 2)]
+    carry = learner.policy(observations[0], np.ones(ROWS, bool), learner.initial_carry(ROWS), 1)[2]
+    goes_on, reset = np.zeros(ROWS, bool), np.arange(ROWS) == 1
+    before, _, after = (learner.policy(observations[1], flags, carry, 2) for flags in (goes_on, reset, goes_on))
+    for index, name in enumerate(("action", "latents")):
+        script.compare(f"{name} of the same step again", after[index], before[index], magnitude=1.0, bound=0.0)
 
 
 @script("AGT-8", "AGT-9", "AGT-10", uses=["Learner"], level=3)

@@ -5,7 +5,9 @@ see conformance/statistics.py, which counts these checks.
 """
 
 import itertools
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 
@@ -23,7 +25,7 @@ from conformance.statistics import (
     normal_square_radius,
 )
 from reference_numpy.distributions import bounded_normal, unimix_log_probs
-from spec import parameter_table
+from spec import Config, Spaces, parameter_table
 
 EXACT = ("float64", "float32")  # samplers compute in float32 or better
 SAMPLES = 50_000
@@ -99,18 +101,26 @@ def actions_have_their_distribution(script: Script) -> None:
 @script("AGT-1", "AGT-3", "AGT-4", "AGT-5", "AGT-6", "LAY-9", "LAY-10", uses=["draw_parameters"], level=1, dtypes=EXACT)
 def parameters_have_their_distribution(script: Script) -> None:
     """Names and shapes of the table; exact zeros and ones; kernels follow the truncated normal, each by itself and all
-    together."""
-    setting, task = script.setting, spaces()
+    together, and do not follow each other."""
+    task, config = spaces(), drawn_config(script)
+    compare_parameters(script, task, config, script.call("draw_parameters", task, config, script.setting.seed))
+
+
+def drawn_config(script: Script) -> Config:
+    """Large enough for statistics."""
     sizes = {"units": 48, "deter": 96, "cnn_depth": 4, "actor_outscale": 0.01, "reward_outscale": 0.0}
-    config = small_config(setting.profile, setting.dtype, **sizes)
+    return small_config(script.setting.profile, script.setting.dtype, **sizes)
+
+
+def compare_parameters(script: Script, task: Spaces, config: Config, params: Mapping[str, Any]) -> None:
+    """Fresh parameters against the table, and their kernels against the truncated normal."""
     table = parameter_table(config, task)
-    params = script.call("draw_parameters", task, config, setting.seed)
     script.holds("the names are those of the parameter table", set(params) == set(table))
     random = {
         name: entry for name, entry in table.items() if entry.initializer == "truncated_normal" and entry.outscale
     }
-    level = confidence(2 * len(random) + 1)
-    weights = []
+    level = confidence(2 * len(random) + 1 + math.comb(len(random), 2))
+    weights: dict[str, np.ndarray] = {}
     for name, entry in table.items():
         value = np.asarray(params[name], np.float64)
         require_shape(script, name, value, entry.shape)
@@ -122,8 +132,12 @@ def parameters_have_their_distribution(script: Script) -> None:
         radius = mean_radius(SQUARE_VARIANCE, LARGEST**2 - 1, weight.size, level)
         within(script, f"{name}: mean square in units of its variance", np.mean(weight**2), 1.0, radius)
         compare_distribution(script, name, weight, truncated_cdf, level)
-        weights.append(weight)
-    compare_distribution(script, "all kernels", np.concatenate(weights), truncated_cdf, level)
+        weights[name] = weight
+    compare_distribution(script, "all kernels", np.concatenate(list(weights.values())), truncated_cdf, level)
+    for one, other in itertools.combinations(weights, 2):
+        n = min(weights[one].size, weights[other].size)
+        product, radius = weights[one][:n] @ weights[other][:n] / n, mean_radius(1.0, LARGEST**2, n, level)
+        within(script, f"mean product of {one} and {other}", product, 0.0, radius)
 
 
 def truncated_cdf(weight: np.ndarray) -> np.ndarray:
