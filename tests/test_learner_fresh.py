@@ -4,11 +4,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from safetensors.numpy import load_file
 
-from conformance.problems import small_config, spaces
+from conformance.problems import make_problem, random_carry, small_config, spaces
 from dreamer_spec.backend import Learner, learner_class
 from dreamer_spec.disk import checkpoint
+from impl_torch import agent, rssm
 from spec import Config, Spaces, parameter_table
 
 TASK = spaces("vector", "mixed")
@@ -90,3 +92,38 @@ def test_parameters_come_from_the_seed(backend: str) -> None:
         if name.endswith("kernel") and name.startswith("params") and np.array_equal(array, begun[name])
     ]
     assert set(same) == {"params/reward/out/kernel", "params/critic/out/kernel"}, "only what starts as zeros"
+
+
+@pytest.mark.covers("AGT-7", "BEH-21")
+def test_a_fresh_slow_critic_is_a_copy() -> None:
+    params = {"critic/out/bias": torch.ones(3), "actor/out/bias": torch.ones(2)}
+    state = agent.initial_state(params)
+    params["critic/out/bias"].zero_()
+    assert state["slow_critic"]["critic/out/bias"].tolist() == [1, 1, 1]
+
+
+@pytest.mark.covers("RSSM-12", "RSSM-23")
+def test_one_observed_step_has_the_gradient_of_a_sequence_of_one() -> None:
+    """Whoever walks through a sequence step by step learns the same: the straight-through sample included."""
+    problem = make_problem(0, "paper", "vector", "discrete", "float64")
+    config, rng = problem.config, np.random.default_rng(0)
+    params = {name: torch.tensor(value) for name, value in problem.state["params"].items()}
+    carry = {name: torch.tensor(value) for name, value in random_carry(rng, config, (2,)).items()}
+    inputs = (torch.tensor(rng.normal(size=(2, config.units))), torch.zeros(2, problem.spaces.action_size).double())
+    is_first, uniform = torch.tensor([False, True]), torch.tensor(rng.random((2, config.stoch)))
+    weights = torch.tensor(rng.normal(size=(2, config.stoch, config.classes)))
+
+    def gradients(of_sequence: bool) -> list[torch.Tensor]:
+        leaves = {name: value.clone().requires_grad_() for name, value in params.items() if name.startswith("rssm/")}
+        if of_sequence:
+            steps = (x[:, None] for x in (*inputs, is_first, uniform))
+            stoch = rssm.observe(leaves, carry, *steps, config)["stoch"][:, 0]
+        else:
+            stoch = rssm.observe_step(leaves, carry, *inputs, is_first, uniform, config)[0]["stoch"]
+        found = torch.autograd.grad((stoch * weights).sum(), list(leaves.values()), materialize_grads=True)
+        return list(found)
+
+    step, sequence = gradients(of_sequence=False), gradients(of_sequence=True)
+    assert any(x.abs().max() > 0.01 for x in step)
+    for one, other in zip(step, sequence, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-12)

@@ -2,7 +2,7 @@
 
 import dataclasses
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -96,7 +96,12 @@ class TorchAdapter:
                 converted[0] = converted[0].to(DTYPES[self._dtype])
             if function in (layers.dense, layers.mlp):
                 converted[2] = converted[2].to(DTYPES[self._dtype])
-            return function(*converted)
+            kept = [x.detach().clone() for x in _tensors(converted)]
+            result = function(*converted)
+            for before, x in zip(kept, _tensors(converted), strict=True):
+                if not torch.equal(before.nan_to_num(), x.nan_to_num()):
+                    raise RuntimeError(f"{function.__name__} wrote into an argument of shape {list(x.shape)}")
+            return result
 
         return call
 
@@ -120,6 +125,15 @@ def _function(name: str) -> tuple[Callable[..., Any], bool]:
         if not name.startswith("_") and getattr(function, "__module__", None) == chapter.__name__:
             return function, chapter in NARROW and name != "truncated_normal"
     raise AttributeError(name)
+
+
+def _tensors(x: Any) -> Iterator[torch.Tensor]:
+    """The tensors of a nested value."""
+    if isinstance(x, torch.Tensor):
+        yield x
+    elif isinstance(x, Mapping | tuple | list):
+        for entry in x.values() if isinstance(x, Mapping) else x:
+            yield from _tensors(entry)
 
 
 def _with_pair(arguments: tuple[Any, ...]) -> tuple[Any, ...]:
