@@ -32,7 +32,7 @@ TRIES = {KNOWN: 8, GENERATED: 3, PAIR: 3}
 ALIKE = 4  # variants that are told apart by further checks
 # How often functions of the reference may be entered for a comparison: some microseconds each. So much for any run, and
 # so much more for each check that was judged.
-WORK, WORK_OF_A_CHECK = 2_500_000, 5_000
+WORK, WORK_OF_A_CHECK = 1_500_000, 4_000
 SHARES = {KNOWN: 0.6, GENERATED: 0.9, PAIR: 1.0}  # of the work, up to which each kind may go
 OVERHEAD = 50  # of a comparison, in the same unit
 VALUES = tuple(

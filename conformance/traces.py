@@ -32,12 +32,10 @@ ORDINARY, EXTREME, WHOLE = "ordinary", "extreme", "whole"
 
 @dataclasses.dataclass
 class Answer:
-    """What came of one call: a result, or the name of an exception's class. demand: what the check says of it; refusal:
-    that any exception is what it demands."""
+    """What came of one call: a result, or the name of an exception's class. demand: what the check says of it."""
 
     function: str
-    demand: Equal | None = None
-    refusal: bool = False
+    demand: Equal | Refused | None = None
     result: Any = None
     raised: str | None = None
 
@@ -46,13 +44,15 @@ class Answer:
 class Trace:
     """The answers of a candidate to the calls of a part of a check, up to the first deviation.
 
-    reach: what the reference enters until it answers otherwise; work: how often it enters functions. raises: whether
-    what the candidate answers otherwise is an exception.
+    any_error: whether what must be refused may be with any exception. reach: what the reference enters until it
+    answers otherwise; work: how often it enters functions. raises: whether what the candidate answers otherwise is an
+    exception.
     """
 
     check: Check
     part: str
     answers: list[Answer]
+    any_error: bool = False
     reach: frozenset[str] = frozenset()
     work: int = 0
     raises: bool = False
@@ -84,7 +84,7 @@ def evidence(adapter: object, check: Check, setting: Setting) -> list[Trace]:
 
 def record(adapter: object, check: Check, setting: Setting, part: str, to_the_end: bool = False) -> tuple[Trace, bool]:
     """A trace, and whether the check fails. to_the_end: goes on after the first deviation."""
-    trace = Trace(check, part, [])
+    trace = Trace(check, part, [], any_error=bool(getattr(adapter, "refuses_anyhow", False)))
     comparisons = (Unjudged if to_the_end else Comparisons)(setting.dtype)
     fails = _run(trace, setting, adapter, comparisons, trace.answers.append)
     return trace, fails
@@ -97,7 +97,7 @@ def follows(adapter: object, trace: Trace, setting: Setting, to_the_end: bool = 
     def compare(answer: Answer) -> None:
         nonlocal count
         count += 1
-        if count <= len(trace.answers) and not same(answer, trace.answers[count - 1], setting):
+        if count <= len(trace.answers) and not same(answer, trace.answers[count - 1], setting, trace.any_error):
             raise _Differs
 
     comparisons = (Unjudged if to_the_end else Comparisons)(setting.dtype)
@@ -136,7 +136,7 @@ def _run(
         if left >= 0:
             note(answer)
 
-    noted = _noting(ask, note_some, any_error=bool(getattr(adapter, "refuses_anyhow", False)))
+    noted = _noting(ask, note_some)
     if trace.part == EXTREME:
         body = functools.partial(_run_extreme, check, setting, noted, comparisons, adapter)
     else:
@@ -157,13 +157,11 @@ class _Differs(BaseException):
     """Another answer than in the trace. Not an Exception: it is no failure of what is asked."""
 
 
-def _noting(ask: Ask, note: Callable[[Answer], None], any_error: bool) -> Ask:
+def _noting(ask: Ask, note: Callable[[Answer], None]) -> Ask:
     """Notes the answers, those of objects that are made included."""
 
     def noted(call: Call, demand: Equal | Refused | None) -> Any:
-        whole = demand if isinstance(demand, Equal) else None
-        refusal = any_error and isinstance(demand, Refused)
-        result = _noted(Answer(call.function, whole, refusal), note, lambda: ask(call, demand))
+        result = _noted(Answer(call.function, demand), note, lambda: ask(call, demand))
         return _Object(result, note) if call.function in OBJECTS else result
 
     return noted
@@ -204,12 +202,12 @@ class _Object:
         return int(_noted(Answer("__len__"), self._note, lambda: len(self._made)))
 
 
-def same(answer: Answer, noted: Answer, setting: Setting) -> bool:
-    """Whether two answers agree."""
+def same(answer: Answer, noted: Answer, setting: Setting, any_error: bool = False) -> bool:
+    """Whether two answers agree. What comes of a call that should have been refused says nothing."""
     if answer.function != noted.function:
         return False
-    if noted.refusal and answer.raised and noted.raised:
-        return True
+    if isinstance(noted.demand, Refused):
+        return bool(answer.raised) == bool(noted.raised) if any_error else answer.raised == noted.raised
     if answer.raised != noted.raised:
         return False
     ruler, demand = Comparisons(setting.dtype), noted.demand
