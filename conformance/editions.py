@@ -19,12 +19,13 @@ from conformance.adapters.numpy_adapter import NumpyAdapter
 from conformance.case import Call, Equal, Refused, Setting
 from conformance.check import CHECKS, Check
 from conformance.compare import WIDE, Comparisons, Unjudged, Worst, round_to
-from conformance.diagnosis import AGREEMENT, DERIVATIVES, VALUES
+from conformance.diagnosis import VALUES
 from conformance.execute import FAILING, CheckOptions, Result, missing, not_offered, outcome, run, run_check
 from conformance.judge import Ask, asking, copied, judge_refusal, standing_in
 from conformance.mutants import MUTANTS, Mutant, MutantAdapter
 from conformance.mutants.trial import on_the_mutant, on_the_reference
 from conformance.offered import narrowed
+from conformance.traces import AGREEMENT, DERIVATIVES
 from spec import Edition, editions
 
 NOT_JUDGED = "not in edition"

@@ -58,6 +58,7 @@ def result_data(
     diagnoses: Sequence[Mapping[str, Any]] | None = (),
     choice: str = "given",
     fit: Data | None = None,
+    is_cut: bool = False,
 ) -> Data:
     """A run and everything that was found.
 
@@ -67,6 +68,7 @@ def result_data(
         were not looked for.
       choice: how the edition was chosen: "given", "claimed" or "best fit".
       fit: how well each edition fits, as the schema's `fit` says; None where that was not asked.
+      is_cut: whether the diagnosis reached its limit before everything was compared.
 
     `share` is the worst deviation as a share of the allowed one; it is null where what failed has no size.
     """
@@ -90,6 +92,7 @@ def result_data(
         "checks": {result.check.name: check_data(result, options, expected) for result in results},
         "requirements": {one.requirement: _requirement(one) for one in by_requirement(results)},
         "diagnoses": None if diagnoses is None else [dict(diagnosis) for diagnosis in diagnoses],
+        "diagnosis_is_cut": is_cut,
     }
 
 

@@ -32,7 +32,7 @@ def diagnosed(name: str) -> list[Diagnosis]:
     mutant = MUTANTS[name]
     results = list(trial(mutant, relevant(mutant, reach()), EXAMPLES))
     unmoved = [Result(check, "pass", Worst(), 1) for check in reach() if not reach()[check] & mutant.edits.keys()]
-    return diagnose(MutantAdapter(mutant), results + unmoved, Setting("float64", "paper", 0, EXAMPLES))
+    return diagnose(MutantAdapter(mutant), results + unmoved, Setting("float64", "paper", 0, EXAMPLES)).diagnoses
 
 
 @pytest.mark.parametrize(
@@ -48,7 +48,7 @@ def diagnose_in(adapter: object, *only: str, dtype: str = "float64") -> list[Dia
     """Of an adapter, from the checks whose name or requirements contain one of these texts."""
     checks = [check for text in only for check in selected_checks(dtype, text)]
     results = [run_check(check, adapter, Setting(dtype, "paper", examples=EXAMPLES), shrink=False) for check in checks]
-    return diagnose(adapter, results, Setting(dtype, "paper", examples=EXAMPLES))
+    return diagnose(adapter, results, Setting(dtype, "paper", examples=EXAMPLES)).diagnoses
 
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
@@ -156,6 +156,7 @@ def test_nothing_is_wrong_with_the_reference() -> None:
 def test_the_words_of_a_diagnosis() -> None:
     (found,) = diagnose_in(MutantAdapter(MUTANTS["return_bootstraps_from_itself"]), "returns.lambda_return_literals")
     assert found.to_json() == {
+        "kind": "known",
         "mutant": "return_bootstraps_from_itself",
         "explanation": (
             "lambda-return bootstraps from its own value: reward, continue and value "

@@ -104,7 +104,7 @@ def main(console: Console, options: argparse.Namespace) -> int:
             progress.over("editions", failing), adapter, editions()[named], asked.dtype, asked.seed
         ):
             fits = _fit(progress, checks, adapter, options)
-        diagnoses = None if options.no_diagnosis else _diagnoses(progress, adapter, results, asked)
+        diagnoses, is_cut = (None, False) if options.no_diagnosis else _diagnoses(progress, adapter, results, asked)
         choice = "given" if given else "claimed" if named else "best fit"
         data = result_data(
             asked,
@@ -114,6 +114,7 @@ def main(console: Console, options: argparse.Namespace) -> int:
             diagnoses,
             choice,
             to_json(fits, asked.edition) if fits else None,
+            is_cut,
         )
     terminal.show(console, data)
     if options.json:
@@ -145,12 +146,16 @@ def _run_all(progress: Progress, checks: list[Check], adapter: object, asked: Ch
         yield judge_twice(check, adapter, edition, asked.dtype, asked.seed, asked.examples)
 
 
-def _diagnoses(progress: Progress, adapter: object, results: list[Result], asked: CheckOptions) -> list[Data]:
-    """The mistakes that explain failures. What the edition has otherwise is none."""
+def _diagnoses(
+    progress: Progress, adapter: object, results: list[Result], asked: CheckOptions
+) -> tuple[list[Data], bool]:
+    """The mistakes that explain failures, and whether there was more to compare. What the edition has otherwise is
+    none."""
     progress.say("diagnosis")
     edition = editions()[asked.edition]
     results = [
         result for result in results if result.status not in FAILING or not by_comparison(result, edition, asked)
     ]
     found = diagnose(adapter, results, asked.setting, progress.over)
-    return [diagnosis.to_json() for diagnosis in found if diagnosis.mutant.name not in edition.mutants]
+    others = [diagnosis for diagnosis in found.diagnoses if diagnosis.mutant.name not in edition.mutants]
+    return [diagnosis.to_json() for diagnosis in others], found.is_cut

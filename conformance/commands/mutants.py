@@ -67,7 +67,7 @@ def main(console: Console, options: argparse.Namespace) -> int:
                 unmoved = [
                     Result(check, "pass", Worst(), 1) for check in reach if not reach[check] & mutant.edits.keys()
                 ]
-                found = diagnose(MutantAdapter(mutant), [*results, *unmoved], setting_of_trials(EXAMPLES))
+                found, _ = diagnose(MutantAdapter(mutant), [*results, *unmoved], setting_of_trials(EXAMPLES))
                 entry["diagnosis"] = [diagnosis_report(diagnosis) for diagnosis in found]
             view.add_row(*_row(mutant, entry))
     console.print(view)

@@ -20,13 +20,18 @@ from conformance.requirements import chapter_of
 Replacements = Mapping[str, Callable[..., Any]]
 
 
+KNOWN, PAIR, GENERATED = "known", "pair", "generated"
+"""Kinds of mutants: of the catalogue, two of it in one, and a single term of an equation changed by rule."""
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Mutant:
     """One mistake.
 
     name: what it is called. explanation: what the wrong code does. provenance: who made the mistake, or where it
     stands. violates: requirement ids, the chapter of the first is the mutant's. fix: what to do about it. edits:
-    "chapter.function" or "chapter.Class" of the reference -> {right: wrong}, each text once in the source.
+    "chapter.function" or "chapter.Class" of the reference -> {right: wrong}, each text once in the source, changed in
+    this order.
     """
 
     name: str
@@ -35,6 +40,7 @@ class Mutant:
     violates: tuple[str, ...]
     fix: str
     edits: Mapping[str, Mapping[str, str]]
+    kind: str = KNOWN
 
     @property
     def chapter(self) -> str:
@@ -53,7 +59,7 @@ class Mutant:
 def _edited(mutant: str, target: str, edits: Mapping[str, str]) -> Callable[..., Any]:
     chapter, name = target.split(".")
     module = importlib.import_module(f"reference_numpy.{chapter}")
-    source = inspect.getsource(getattr(module, name))
+    source = source_of(target)
     for right, wrong in edits.items():
         if source.count(right) != 1:
             raise ValueError(f"mutant {mutant}: {target} holds {source.count(right)} times {right!r}")
@@ -63,6 +69,13 @@ def _edited(mutant: str, target: str, edits: Mapping[str, str]) -> Callable[...,
     exec(compile(source, f"<mutant {mutant}>", "exec"), vars(module), made)
     wrong_version: Callable[..., Any] = made[name]
     return wrong_version
+
+
+@functools.cache
+def source_of(target: str) -> str:
+    """The source of a function or class of the reference, "chapter.name"."""
+    chapter, name = target.split(".")
+    return inspect.getsource(getattr(importlib.import_module(f"reference_numpy.{chapter}"), name))
 
 
 @contextlib.contextmanager

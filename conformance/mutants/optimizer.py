@@ -169,6 +169,18 @@ MUTANTS = (
         edits={"optimizer.laprop": {"np.where(np.abs(gradient) < DEAD_ZONE, 0.0, gradient)": "gradient"}},
     ),
     Mutant(
+        name="zero_over_zero",
+        explanation="a gradient of 0 is divided by a root of 0, which is NaN where the epsilon is 0",
+        provenance="Optax and TorchRL, whose updates divide in one operation",
+        violates=("OPT-10",),
+        fix="Where the gradient is 0, the normalized gradient is 0.",
+        edits={
+            "optimizer.laprop": {
+                "np.where(gradient == 0, 0.0, gradient / np.where(gradient == 0, 1.0, root))": "gradient / root"
+            }
+        },
+    ),
+    Mutant(
         name="weight_decay",
         explanation="parameters decay",
         provenance="plausible: DreamerV2 has a weight decay of 1e-6 (D-79)",

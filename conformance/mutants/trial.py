@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import sys
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from types import FrameType
 from typing import Any
@@ -17,14 +18,14 @@ Reach = Mapping[Check, frozenset[str]]
 
 
 @contextlib.contextmanager
-def tracing(entered: set[str]) -> Iterator[None]:
-    """While this context lasts, the functions and classes of the reference that are entered are added, as
+def tracing(entered: Counter[str]) -> Iterator[None]:
+    """While this context lasts, it is counted how often the functions and classes of the reference are entered, as
     "chapter.name"."""
 
     def note(frame: FrameType, event: str, argument: Any) -> None:
         module = frame.f_globals.get("__name__", "")
         if event == "call" and module.startswith("reference_numpy."):
-            entered.add(f"{module.removeprefix('reference_numpy.')}.{frame.f_code.co_qualname.partition('.')[0]}")
+            entered[f"{module.removeprefix('reference_numpy.')}.{frame.f_code.co_qualname.partition('.')[0]}"] += 1
 
     before = sys.getprofile()
     sys.setprofile(note)
@@ -38,7 +39,7 @@ class TracedReference:
     """The reference, with a note of what its calls entered."""
 
     def __init__(self) -> None:
-        self.entered: set[str] = set()
+        self.entered: Counter[str] = Counter()
         self._reference = NumpyAdapter()
 
     def __getattr__(self, name: str) -> Any:

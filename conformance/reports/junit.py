@@ -68,7 +68,7 @@ def _details(data: Data, name: str, check: Data) -> str:
     failure = check["failure"]
     values = [f"{value['name']}: {value['type']}\n{value['text']}" for value in summary.values(failure)]
     diagnoses = [
-        f"{summary.likeness(found)} {found['mutant']}: {found['explanation']} {found['fix']}"
+        f"{summary.introduction(found)}: {found['explanation']}. {found['fix']}"
         for found in summary.matching(data, name)
     ]
     return "\n\n".join(

@@ -75,18 +75,21 @@ def _chapters(data: Data) -> str:
 
 def _diagnoses(data: Data) -> list[str]:
     lines = [
-        f"- **{text(found['mutant'])}**: {text(found['explanation'])} See "
-        f"{chapter(found['chapter'])}. {text(found['fix'])} "
+        f"- {_introduced(found)}: {sentence(found['explanation'])}. See "
+        f"{chapter(found['chapter'])}. {sentence(found['fix'])} "
         f"Explains {', '.join(map(code, found['explained']))}."
         + (f" Known from: {text(found['provenance'])}." if found["provenance"] else "")
-        + (
-            f" Only the nearest: it would fail {code(refuted)}, which passes."
-            if (refuted := found.get("refuted_by"))
-            else ""
-        )
+        + (f" Only the nearest, {text(objection)}." if (objection := summary.objection(data, found)) else "")
         for found in summary.diagnoses(data)
     ]
     return ["## It behaves like", "\n".join(lines)] if lines else []
+
+
+def _introduced(diagnosis: Data) -> str:
+    """The heading says already that it behaves like what has no other words."""
+    words, name = summary.likeness(diagnosis)
+    bold = f"**{text(name or words)}**"
+    return f"{text(words)} {bold}" if name and words != summary.LIKENESS["known"][0] else bold
 
 
 def _requirements(data: Data) -> list[str]:

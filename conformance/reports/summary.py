@@ -22,7 +22,17 @@ STATUSES = ("pass", "fail", "error", EXTREME, "expected failure", "partly offere
 """As told: a failure may be only with extreme input, or expected; of a requirement, some checks may be offered and
 others not."""
 NAMED = 3  # checks that a line names
+CUT = "Not all were compared with all known mistakes: the search ends after the same amount of work on every machine."
 SENTENCES = 3  # requirements of a check that are told in full
+LIKENESS = {
+    "known": ("behaves like", "nearest known mistake:"),
+    "pair": ("behaves like two mistakes at once:", "nearest known mistakes, both at once:"),
+    "generated": (
+        "no known mistake, but generated from the equation",
+        "no known mistake; the nearest variant that is generated from an equation",
+    ),
+}
+"""Words before the name of a mutant, by its kind: where nothing speaks against it, and where something does."""
 UNMEASURED = "not measurable"
 SCALE = (
     "The worst deviation, as a share of the allowed one: 100% is the limit, and 20× is twenty times as much. "
@@ -239,7 +249,7 @@ def without_gradients(data: Data) -> list[str]:
 
 
 def undiagnosed(data: Data) -> list[str]:
-    """A line, if any: which failures no known mistake explains."""
+    """Lines, if any: which failures no known mistake explains, and whether all were compared."""
     if data["diagnoses"] is None:
         return ["No diagnosis was made (--no-diagnosis)."]
     failing = [name for name, check in data["checks"].items() if check["status"] in FAILING]
@@ -247,7 +257,8 @@ def undiagnosed(data: Data) -> list[str]:
     if not left:
         return []
     others = f" and {len(left) - NAMED} others" if len(left) > NAMED else ""
-    return [f"No known mistake fits {', '.join(left[:NAMED])}{others}."]
+    lines = [f"No known mistake fits {', '.join(left[:NAMED])}{others}."]
+    return lines + [CUT] * bool(data.get("diagnosis_is_cut"))
 
 
 def tally(data: Data) -> str:
@@ -302,9 +313,25 @@ def diagnoses(data: Data) -> list[Data]:
     return list(data["diagnoses"] or ())
 
 
-def likeness(diagnosis: Data) -> str:
-    """Words before the name of a mutant."""
-    return "nearest known mistake:" if diagnosis.get("refuted_by") else "behaves like"
+def likeness(diagnosis: Data) -> tuple[str, str]:
+    """How a mistake is introduced, and its name: "" of one that is nobody's, but generated from an equation."""
+    is_refuted = bool(diagnosis.get("refuted_by"))
+    kind = diagnosis.get("kind", "known")
+    words = LIKENESS[kind][is_refuted]
+    return words, "" if kind == "generated" else diagnosis["mutant"]
+
+
+def introduction(diagnosis: Data) -> str:
+    """`likeness` in one."""
+    return " ".join(filter(None, likeness(diagnosis)))
+
+
+def objection(data: Data, diagnosis: Data) -> str:
+    """What speaks against a mutant, if anything does."""
+    if not (name := diagnosis.get("refuted_by")):
+        return ""
+    fails = name in data["checks"] and data["checks"][name]["status"] in FAILING
+    return f"but it has other numbers in {name}" if fails else f"but it would fail {name}, which passes"
 
 
 def matching(data: Data, check: str) -> list[Data]:

@@ -30,7 +30,7 @@ def show(console: Console, data: Data) -> None:
     for line in summary.notes(data):
         _plain(console, line)
     for diagnosis in summary.diagnoses(data):
-        _diagnosis(console, diagnosis)
+        _diagnosis(console, data, diagnosis)
     failures = summary.failures(data)
     _failures(console, data, failures.ordinary, SHOWN)
     if failures.extreme:
@@ -77,17 +77,15 @@ def _chapters(console: Console, data: Data) -> None:
         _plain(console, title)
 
 
-def _diagnosis(console: Console, diagnosis: Data) -> None:
-    console.print(
-        f"\n[bold]{summary.likeness(diagnosis)} {escape(diagnosis['mutant'])}[/]: {escape(diagnosis['explanation'])}",
-        highlight=False,
-    )
+def _diagnosis(console: Console, data: Data, diagnosis: Data) -> None:
+    introduction = escape(summary.introduction(diagnosis))
+    console.print(f"\n[bold]{introduction}[/]: {escape(diagnosis['explanation'])}", highlight=False)
     if diagnosis["provenance"]:
         _plain(console, f"  known from: {diagnosis['provenance']}")
     _plain(console, f"  see {diagnosis['chapter']}. {diagnosis['fix']}")
     _plain(console, f"  explains {', '.join(diagnosis['explained'])}")
-    if diagnosis.get("refuted_by"):
-        _plain(console, f"  but it would fail {diagnosis['refuted_by']}, which passes")
+    if objection := summary.objection(data, diagnosis):
+        _plain(console, f"  {objection}")
     if diagnosis["alternatives"]:
         _plain(console, f"  cannot be told from {', '.join(diagnosis['alternatives'])}")
 

@@ -1,5 +1,7 @@
 """Which mutants of the reference a case notices."""
 
+from collections import Counter
+
 import numpy as np
 
 from conformance.adapters.numpy_adapter import NumpyAdapter
@@ -11,13 +13,13 @@ from conformance.vectors.reading import StoredCase, deviations
 def kills(case: StoredCase) -> list[str]:
     """The names of the mutants that deviate from the case, or raise in it. Only those that change what the case calls
     are run."""
-    entered: set[str] = set()
+    entered: Counter[str] = Counter()
     with tracing(entered), np.errstate(all="ignore"):
         deviations(case, NumpyAdapter(), "float64")
     return [
         name
         for name, mutant in MUTANTS.items()
-        if entered & mutant.replacements.keys() and _deviates(case, MutantAdapter(mutant))
+        if not mutant.replacements.keys().isdisjoint(entered) and _deviates(case, MutantAdapter(mutant))
     ]
 
 
