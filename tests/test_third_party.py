@@ -17,7 +17,7 @@ SERVE = Path(__file__).resolve().parent.parent / "conformance" / "serve.py"
 EXAMPLES = SERVE.parent / "examples"
 MODULES = {  # the others are called as their packages
     **{"di_engine": "ding", "rllib": "ray", "sheeprl_v3_5": "sheeprl"},
-    **{"dreamerv3_torch": "exploration", "r2dreamer": "rssm"},
+    **{"dreamerv3_2026": "embodied", "dreamerv3_torch": "exploration", "r2dreamer": "rssm"},
 }
 FEW = 10  # cases of a property
 NOT_JUDGED = ("not offered", "not in edition")
