@@ -192,13 +192,15 @@ def implementation_mutant_kinds() -> str:
 
 
 def implementation_mutants() -> str:
-    """The committed run of `conformance mutants --implementations --json`, and what it missed."""
+    """The committed runs of `conformance mutants --implementations --json`, and what they missed."""
     path = RESULTS / "implementation-mutants.json"
     if not path.exists():
         return f"No run of all of them is recorded yet (`{path.relative_to(ROOT)}`).\n"
     found = json.loads(path.read_text(encoding="utf-8"))["mutants"]
     rows = [[kind, *map(str, row)] for kind, row in mutant_report.counts(found).items()]
     table = markdown_table(["kind", *mutant_report.COLUMNS], rows)
+    if left := len(implementations.patches()) - len(found):
+        table += f"\nNot run yet: {left} of {len(implementations.patches())}.\n"
     missed = [
         [f"`{name}`", f"`{entry['file']}`", entry["explanation"].replace("|", "\\|")]
         for name, entry in found.items()
