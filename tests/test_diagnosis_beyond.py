@@ -4,6 +4,7 @@ once, mistakes that only extreme input shows, and where its search ends."""
 import functools
 import importlib
 import inspect
+import io
 import types
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -11,6 +12,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from html_document import Document
+from report_data import FAIL, PASS, make
+from rich.console import Console
 
 from conformance import diagnosis
 from conformance.adapters.numpy_adapter import NumpyAdapter
@@ -24,6 +28,7 @@ from conformance.mutants.pairs import both, pairs
 from conformance.mutants.reach import reach_of, suspects
 from conformance.mutants.trial import on_the_reference
 from conformance.mutants.variants import CHAPTERS, variants
+from conformance.reports import html, junit, summary, terminal
 from reference_numpy import returns, world_model
 from spec import editions
 
@@ -307,3 +312,28 @@ def test_a_run_that_fails_asks_at_most_twice_as_much(name: str) -> None:
 
     target = next(target for target in functions() if target.endswith(f".{name}"))
     assert calls_of(PlantedAdapter({target: wrong[name]})) <= 2 * calls_of(right)
+
+
+def shown(data: Any) -> str:
+    console = Console(file=io.StringIO(), width=150)
+    terminal.show(console, data)
+    return console.file.getvalue()  # type: ignore[attr-defined]
+
+
+def test_what_is_generated_is_told_from_what_is_known() -> None:
+    data = make()
+    found = {"known": "behaves like return_", "pair": "behaves like two mistakes at once: return_"}
+    found["generated"] = "no known mistake, but generated from the equation: lambda-return bootstraps"
+    for kind, told in found.items():
+        made = {**data, "diagnoses": [{**data["diagnoses"][0], "kind": kind}], "diagnosis_is_cut": True}
+        assert told in shown(made)
+        assert told in junit.render(made)
+        assert told.capitalize() in Document(html.render([made])).text
+        assert summary.CUT in shown(made)
+    nearest = {**data["diagnoses"][0], "kind": "generated", "refuted_by": FAIL}
+    text = shown({**data, "diagnoses": [nearest]})
+    assert "no known mistake; the nearest variant that is generated from an equation: " in text
+    assert f"but it has other numbers in {FAIL}" in text
+    text = shown({**data, "diagnoses": [{**nearest, "kind": "known", "refuted_by": PASS}]})
+    assert "nearest known mistake: return_" in text
+    assert f"but it would fail {PASS}, which passes" in text

@@ -23,6 +23,7 @@ from conformance.editions import (
     fits_better,
     judge,
     judge_twice,
+    may_fit_better,
     own_reference,
     telling_checks,
 )
@@ -406,6 +407,14 @@ def test_what_is_not_judged_does_not_pass(tmp_path: Path, capsys: pytest.Capture
     assert main([*run, "--edition", "2023"]) == 1
     assert "1 checks, 0 numbers compared: 1 not in edition" in capsys.readouterr().out
     assert main([*run, "--edition", "2023", "--at-least", "0"]) == 0
+
+
+def test_editions_are_compared_only_where_a_failure_passes_in_another() -> None:
+    check = CHECKS["transforms.twohot_literals"]
+    broken = types.SimpleNamespace(twohot=lambda x, bins: np.zeros((*np.shape(x), len(bins))))
+    assert may_fit_better([check], reference("2023"), editions()["paper"], "float64")
+    assert not may_fit_better([check], broken, editions()["paper"], "float64")
+    assert not may_fit_better([], reference("2023"), editions()["paper"], "float64")
 
 
 def test_returns_are_the_same_in_all_editions() -> None:
