@@ -23,12 +23,14 @@ from conformance.statistics import (
     normal_mean_radius,
     normal_square_radius,
 )
+from reference_numpy import agent
 from reference_numpy.layers import TRUNCATED_NORMAL_STD
 from spec import Config, Spaces, parameter_table
 
+FRESH = selected_checks("float64", "learner.fresh_parameters")
 CHECKS = {
     check.name.partition(".")[2]: check
-    for check in (*selected_checks("float64", "sampling."), *selected_checks("float64", "learner.noise"))
+    for check in (*selected_checks("float64", "sampling."), *selected_checks("float64", "learner.noise"), *FRESH)
 }
 
 
@@ -38,13 +40,16 @@ def status(name: str, adapter: object, seed: int = 0) -> tuple[str, str]:
 
 
 class Sampling(NumpyAdapter):
-    """The reference, and of a learner the noise."""
+    """The reference, and of a learner the noise and the fresh parameters."""
 
     class Learner:
         def __init__(self, task: Spaces, config: Config, seed: int) -> None:
-            self.task, self.config = task, config
-            self.state_dict = self.load_state_dict = self.train_step = self.initial_carry = self.policy = print
-            self.policy_noise = print
+            self.task, self.config, self.seed = task, config, seed
+            self.load_state_dict = self.train_step = self.initial_carry = self.policy = self.policy_noise = print
+
+        def state_dict(self) -> dict[str, np.ndarray]:
+            params = NumpyAdapter().draw_parameters(self.task, self.config, self.seed)
+            return agent.flatten_state(agent.initial_state(params))
 
         def train_noise(self, batch: Any, seed: int) -> dict[str, np.ndarray]:
             rows, steps = batch["reward"].shape
@@ -61,8 +66,8 @@ def test_every_statistical_check_is_counted() -> None:
 
 
 def test_the_level_is_shared_out() -> None:
-    """L of 10 tests in each of 5 checks: 50 tests with 2 exp(-L) each make one false alarm in a million runs."""
-    assert 50 * 2 * math.exp(-statistics.confidence(10)) == pytest.approx(1e-6)
+    """L of 10 tests in each of 6 checks: 60 tests with 2 exp(-L) each make one false alarm in a million runs."""
+    assert 60 * 2 * math.exp(-statistics.confidence(10)) == pytest.approx(1e-6)
 
 
 @pytest.mark.parametrize("name", CHECKS)

@@ -168,7 +168,7 @@ def test_its_actions_are_those_of_the_backends(policy: Policy, adapter: Any) -> 
     }
     carry = {"deter": np.zeros((ROWS, CONFIG.deter)), "stoch": np.zeros((ROWS, CONFIG.stoch, CONFIG.classes))}
     expected, seen = np.zeros((ROWS, TASK.action_size)), []
-    for step in range(8):
+    for step in range(16):
         noise = {"posterior": uniforms(rng, ROWS, CONFIG.stoch), "action": action_noise(rng, TASK, (ROWS,))}
         is_first = np.array([step == 0, step in (0, 3), step in (0, 3, 4), step == 0])
         carry, expected = backend.policy_step(params, carry, expected, observation(step), is_first, noise, TASK, CONFIG)
