@@ -13,7 +13,7 @@ from importlib import resources
 from pathlib import PurePosixPath
 from typing import Any
 
-CATALOGUES = ("torch", "jax", "learners", "trainer")
+CATALOGUES = ("torch", "jax", "learners", "trainer", "thirty")
 KINDS = {
     "wrong_axis": "a fused operation along a wrong axis, or along too many",
     "precision": "right in one precision and wrong in another: a cast too early, a sum or a product in a narrow one",
