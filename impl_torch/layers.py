@@ -176,7 +176,7 @@ def norm_gradients(gradient: Tensor, normal: Tensor, inverse: Tensor, scale: Ten
     n = ρ x with ρ = 1 / sqrt(mean(x²) + epsilon) over N entries, so dn_j/dx_k = ρ (δ_jk - n_j n_k / N), and
     ∂x = ρ (a - n mean(a n)) with a = gradient * scale.
     """
-    by_scale = (gradient * normal).sum(tuple(range(gradient.ndim - scale.ndim)))  # over every row
+    by_scale = (gradient * normal).sum_to_size(scale.shape)  # over every row; a sum over no axes would be over all
     scaled = gradient * scale  # a
     along = (scaled * normal).mean(-1, keepdim=True)  # [..., 1]
     return torch.addcmul(scaled, normal, along, value=-1).mul_(inverse), by_scale

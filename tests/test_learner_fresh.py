@@ -10,7 +10,7 @@ from safetensors.numpy import load_file
 from conformance.problems import make_problem, random_carry, small_config, spaces
 from dreamer_spec.backend import Learner, learner_class
 from dreamer_spec.disk import checkpoint
-from impl_torch import agent, rssm
+from impl_torch import agent, layers, rssm
 from spec import Config, Spaces, parameter_table
 
 TASK = spaces("vector", "mixed")
@@ -127,3 +127,11 @@ def test_one_observed_step_has_the_gradient_of_a_sequence_of_one() -> None:
     assert any(x.abs().max() > 0.01 for x in step)
     for one, other in zip(step, sequence, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.covers("LAY-8")
+def test_a_layer_without_leading_axes_has_its_gradient() -> None:
+    vector, scale = (torch.tensor(x, requires_grad=True) for x in ([1.0, -2.0, 3.0], [1.0, 0.5, 2.0]))
+    (one,) = torch.autograd.grad(layers.norm_silu(vector, scale, 1e-4).sum(), [scale])
+    (row,) = torch.autograd.grad(layers.norm_silu(vector[None], scale, 1e-4).sum(), [scale])
+    torch.testing.assert_close(one, row)

@@ -177,8 +177,9 @@ def gradient_of_the_vector_loss(setting: Setting) -> Cases:
 @check("LAY-4", uses=["rms_norm", "vjp"], level=0, dtypes=WHOLE)
 def gradient_of_the_norm(setting: Setting) -> Cases:
     """Through the mean square too, and into the scale."""
-    arguments = (normal(setting, 4, 6), 1 + normal(setting, 6, scale=0.2, seed=1), 1e-2)
-    yield pulled_back(setting, layers.rms_norm, ("x", "scale"), *arguments)
+    for leading in ((4,), ()):
+        arguments = (normal(setting, *leading, 6), 1 + normal(setting, 6, scale=0.2, seed=1), 1e-2)
+        yield pulled_back(setting, layers.rms_norm, ("x", "scale"), *arguments)
 
 
 @check("WM-12", "WM-14", uses=["kl_losses", "vjp"], level=0, dtypes=WHOLE)

@@ -5,6 +5,7 @@ import dataclasses
 import json
 import re
 import shlex
+import signal
 import subprocess
 import sys
 import tempfile
@@ -20,6 +21,7 @@ JUDGING = "conformance.mutants.implementations.judging"
 DTYPES = ("float32", "float64", "bfloat16")
 TIMEOUT = 1800.0  # seconds of one process: a mutant may hang
 EXAMPLES = 5
+CRASHES = (signal.SIGSEGV, signal.SIGABRT)  # of the mutant's own making; somebody may have ended the process otherwise
 
 
 @dataclasses.dataclass(frozen=True)
@@ -131,7 +133,7 @@ def judged(
     ran = _run([sys.executable, "-m", JUDGING, json.dumps(request)], root, compiled)
     if ran is None:
         return Outcome("check", "(the process did not end)", None, "timeout")
-    if ran.returncode < 0:
+    if -ran.returncode in CRASHES:
         return Outcome("check", f"(the process got signal {-ran.returncode})", None, "signal")
     if ran.returncode:
         raise RuntimeError(f"judging {patch.name} ended with {ran.returncode}:\n{ran.stderr[-2000:]}")
