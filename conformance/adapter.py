@@ -16,6 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from conformance.compare import DTYPES
+from conformance.serve import OBJECTS as OBJECTS
 from spec import Config, Parameter, Spaces
 
 Array = np.ndarray
@@ -439,9 +440,6 @@ INTERFACE: dict[str, tuple[str, ...]] = {
     if inspect.isfunction(function) and not name.startswith("_")
 }
 """Every function that the checks know -> the names of its arguments, which are given by position."""
-
-OBJECTS = ("Learner", "Replay", "ReplayRatio")
-"""Functions of the interface that return objects with methods, and no numbers."""
 
 RESULTS: dict[str, tuple[str, ...]] = {
     "bounded_normal": ("mean", "std"),

@@ -27,7 +27,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 PROTOCOL = 1
-OBJECTS = ("Learner", "Replay", "ReplayRatio")  # their results have methods, which no message holds
+OBJECTS = ("Learner", "Replay", "ReplayRatio")  # functions whose results have methods, which no message holds
 DTYPES = ("bool", "uint8", "int32", "int64", "float32", "float64")
 
 
@@ -273,7 +273,8 @@ def _torch_vjp(function: Any, arguments: Any, leaves: list[Any], cotangents: Any
     found = torch.autograd.grad(total, leaves, allow_unused=True)
     if all(gradient is None for gradient in found):
         raise NotImplementedError("gradients: its results do not come from the tensors that it was given")
-    return [torch.zeros_like(leaf) if gradient is None else gradient for leaf, gradient in zip(leaves, found)]  # noqa: B905
+    pairs = zip(leaves, found)  # noqa: B905 - Python 3.8
+    return [torch.zeros_like(leaf) if gradient is None else gradient for leaf, gradient in pairs]
 
 
 def _jax_vjp(function: Any, arguments: Any, leaves: list[Any], cotangents: Any) -> list[Any]:

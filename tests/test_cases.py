@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from conformance.adapter import INTERFACE, OBJECTS
+from conformance.adapters.numpy_adapter import NumpyAdapter
 from conformance.case import Call, Case, Cases, Drawn, Equal, Setting, equal, exact, judged, refused, related
 from conformance.check import CHECKS, Check, check, script
 from conformance.compare import Comparisons, Deviation, entries
@@ -16,6 +17,7 @@ from conformance.drawing import cases
 from conformance.execute import run_check, selected_checks
 from conformance.judge import asking, judge_case
 from conformance.script import Script
+from reference_numpy import rssm
 
 SETTING = Setting("float64", "paper", examples=2)
 BUILT = [one for one in selected_checks("float64") if one.cases is not None]
@@ -159,3 +161,22 @@ def test_a_check_yields_and_a_script_does_not() -> None:
     with pytest.raises(TypeError, match="@script one that does not"):
         script("X-1", uses=["f"], level=0)(yields)  # type: ignore[arg-type]
     assert not any("test_cases" in name for name in CHECKS)
+
+
+def test_a_long_sequence_that_loses_its_memory_is_seen() -> None:
+    class Forgets(NumpyAdapter):
+        """In sequences of more than 64 steps, from the 65th on."""
+
+        def observe(self, params: Any, carry: Any, *rest: Any) -> Any:
+            *steps, config = rest
+            parts = [slice(0, 64), *([slice(64, None)] if steps[0].shape[1] > 64 else [])]
+            starts = [carry, {name: np.zeros_like(value) for name, value in carry.items()}]
+            done = [
+                rssm.observe(params, start, *(x[:, part] for x in steps), config)
+                for start, part in zip(starts, parts, strict=False)
+            ]
+            return {name: np.concatenate([part[name] for part in done], 1) for name in done[0]}
+
+    check = CHECKS["large.a_sequence_is_its_halves"]
+    for adapter, status in ((NumpyAdapter(), "pass"), (Forgets(), "fail")):
+        assert run_check(check, adapter, Setting("float64", "paper")).status == status

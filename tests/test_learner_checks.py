@@ -5,7 +5,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
+import conformance.cases  # noqa: F401 - registers the checks
 from conformance.adapters.torch_adapter import TorchAdapter
 from conformance.case import Setting
 from conformance.check import CHECKS
@@ -106,8 +108,30 @@ def one_latent(noise: Noise, seed: int, learner: Any) -> Noise:
     return noise | {"prior": noise["prior"][..., :1].expand_as(noise["prior"]).clone()}
 
 
+class ResetsTheCarryItGets(Learner):
+    def policy(self, observation: Any, is_first: np.ndarray, carry: Any, seed: int, mode: bool = False) -> Any:
+        carry["deter"][torch.as_tensor(is_first)] = 0
+        return super().policy(observation, is_first, carry, seed, mode)
+
+
+class OneKernelForTwo(Learner):
+    def state_dict(self) -> dict[str, Any]:
+        state = super().state_dict()
+        return {**state, "params/critic/hidden1/kernel": state["params/actor/hidden1/kernel"]}
+
+
+class OptionsOfTheFirst(Learner):
+    first: Config | None = None
+
+    def __init__(self, spaces: Spaces, config: Config, **options: Any) -> None:
+        type(self).first = type(self).first or config
+        super().__init__(spaces, type(self).first, **options)
+
+
 MISTAKES = {
-    "train_steps_match": (SlowCriticFirst, RangeForgotten, MomentsFromOne),
+    "train_steps_match": (SlowCriticFirst, RangeForgotten, MomentsFromOne, OptionsOfTheFirst),
+    "fresh_parameters_have_their_distribution": (OneKernelForTwo,),
+    "acting_leaves_its_carry_as_it_was": (ResetsTheCarryItGets,),
     "acting_uses_the_newest_parameters": (StaleActing, StaleAfterLoading),
     "a_state_is_everything": (Forgetful, Shared),
     "noise_is_independent": tuple(

@@ -194,10 +194,12 @@ def acting_leaves_its_carry_as_it_was(script: Script) -> None:
     """A step that resets a row of a carry changes nothing of what another step makes of the same carry."""
     problem = small_problem(script)
     learner = made(script, problem)
-    observations = [random_observations(np.random.default_rng(seed), problem.spaces, (ROWS,)) for seed in (1, 2)]
-    carry = learner.policy(observations[0], np.ones(ROWS, bool), learner.initial_carry(ROWS), 1)[2]
-    goes_on, reset = np.zeros(ROWS, bool), np.arange(ROWS) == 1
-    before, _, after = (learner.policy(observations[1], flags, carry, 2) for flags in (goes_on, reset, goes_on))
+    carry, goes_on, reset = learner.initial_carry(ROWS), np.zeros(ROWS, bool), np.arange(ROWS) == 1
+    observation = random_observations(np.random.default_rng(1), problem.spaces, (ROWS,))
+    for seed, flags in enumerate((~goes_on, goes_on, goes_on)):  # a fresh agent's memory is still 0 after the first
+        carry = learner.policy(observation, flags, carry, seed)[2]
+    before, other, after = (learner.policy(observation, flags, carry, 3) for flags in (goes_on, reset, goes_on))
+    script.holds("a reset shows in the memory", np.any(np.asarray(other[1]["deter"]) != np.asarray(before[1]["deter"])))
     for index, name in enumerate(("action", "latents")):
         script.compare(f"{name} of the same step again", after[index], before[index], magnitude=1.0, bound=0.0)
 

@@ -58,10 +58,8 @@ def demands_of(example: Example, where: str, bound: float, reach: float = 1.0) -
     relative."""
     total, aux = example.losses
     size, range_ = loss_magnitude(aux), np.array(aux["return_range"])
-    returns = ("return_scale", "return_mean", "value_mean")
-    sizes = dict.fromkeys(returns, max(size, reach))
     means = {
-        name: Equal(mean, (1, group, name), where=where + name, magnitude=sizes.get(name, size), bound=bound)
+        name: Equal(mean, (1, group, name), where=where + name, magnitude=size, bound=bound)
         for group in ("losses", "metrics")
         for name, mean in aux[group].items()
     }

@@ -380,7 +380,10 @@ def policy_step(params, carry, prev_action, observation, is_first, noise, spaces
 def draw_parameters(spaces, config, seed):
     """Their parameters are made by a first pass over a batch."""
     model, rows = agent_of(spaces, config), (1, 2)
-    zeros = lambda own: {name: jnp.zeros((*rows, *space.shape), space.dtype) for name, space in own.items()}  # noqa: E731
+
+    def zeros(own):
+        return {name: jnp.zeros((*rows, *space.shape), space.dtype) for name, space in own.items()}
+
     carry = model.init_train(rows[0])[:3]
     whole = partial(model.loss, training=False)
     made = nj.init(whole)({}, carry, zeros(model.obs_space), zeros(model.act_space), seed=seed)

@@ -73,7 +73,10 @@ def agent_of(spaces, config):
     observations = Namespace(spaces={key: Namespace(shape=shape) for key, shape in shapes_of(spaces).items()})
     actions = Namespace(shape=(sum(encoded_size(space) for space in spaces.actions.values()),))
     theirs = networks.MLPHead
-    head = lambda options, inputs: Actor(spaces, config, inputs) if options is actor else theirs(options, inputs)  # noqa: E731
+
+    def head(options, inputs):
+        return Actor(spaces, config, inputs) if options is actor else theirs(options, inputs)
+
     with (
         mock.patch.object(networks, "MLPHead", head),
         mock.patch.object(networks, "MultiDecoder", lambda *arguments: Decoder(spaces, *arguments)),
