@@ -10,6 +10,7 @@ import dataclasses
 import functools
 import math
 import re
+import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -73,13 +74,14 @@ class Report:
     """passed: whether training may start. worst: largest deviation, relative to the size of what deviates. summary: one
     line.
 
-    comparisons: what agreed, up to the first deviation.
+    comparisons: what agreed, up to the first deviation. seconds: that each part took.
     """
 
     passed: bool
     worst: float
     summary: str
     comparisons: list[Agreement]
+    seconds: dict[str, float]
 
 
 def _silent(what: str) -> None:
@@ -119,9 +121,9 @@ def preflight_adapter(
         parts += [("batch", compare_batch, config)]
     elif wide is not None:
         parts += [("gradient", functools.partial(compare_with_float32, wide), config)]
-    names = []  # of what the adapter offers
+    seconds = dict[str, float]()  # of what the adapter offers
     for name, part, sizes in parts:
-        before = len(agreed)
+        before, began = len(agreed), time.perf_counter()
         try:
             for what, function in part(script, adapter, spaces, sizes):
                 agreed.append(
@@ -130,12 +132,12 @@ def preflight_adapter(
                 worst, comparisons.worst = max(worst, comparisons.worst.deviation), Worst()
                 progress(what)
         except Deviation as deviation:
-            return Report(False, comparisons.worst.deviation, f"{name}: {deviation}", agreed)
+            return Report(False, comparisons.worst.deviation, f"{name}: {deviation}", agreed, seconds)
         if len(agreed) > before:
-            names.append(name)
+            seconds[name] = round(time.perf_counter() - began, 2)
     compared = f"{comparisons.compared:,} numbers compared"
-    summary = f"{', '.join(names)} agree with the reference in {config.compute_dtype}, {compared}"
-    return Report(True, worst, summary, agreed)
+    summary = f"{', '.join(seconds)} agree with the reference in {config.compute_dtype}, {compared}"
+    return Report(True, worst, summary, agreed, seconds)
 
 
 def compare_networks(script: Script, adapter: object, spaces: Spaces, config: Config) -> Compared:
@@ -211,11 +213,12 @@ def compare_with_float32(wide: Any, script: Script, adapter: object, spaces: Spa
 
 
 def rows_of_batch(spaces: Spaces, config: Config) -> int:
-    """How many rows of the run's batch are compared."""
+    """How many rows of the run's batch are compared. With images, which take the reference most of its time, the
+    least."""
     weights = sum(math.prod(entry.shape) for entry in parameter_table(config, spaces).values())
     affordable = OPERATIONS / (weights * config.batch_length * (1 + HORIZON))
     least = math.ceil(LEAST_STEPS / config.batch_length)
-    return min(config.batch_size, max(least, int(affordable)))
+    return min(config.batch_size, least if spaces.images else max(least, int(affordable)))
 
 
 def compare_learner(script: Script, adapter: object, spaces: Spaces, config: Config) -> Compared:

@@ -220,6 +220,20 @@ def train_step_table() -> str:
     return markdown_table(header, rows)
 
 
+def preflight_table() -> str:
+    """A committed run of `benchmarks.preflight`: seconds of each part, "" where a precision does without it."""
+    report = json.loads((RESULTS / "preflight.json").read_text(encoding="utf-8"))
+    parts = ("networks", "losses and gradient", "learner", "batch", "gradient")
+    rows = []
+    for entry in report["results"]:
+        seconds = [entry["parts"].get(part) for part in parts]
+        rows.append(
+            [entry[name] for name in ("size", "observation", "dtype", "backend")]
+            + ["" if value is None else f"{value:.1f}" for value in (*seconds, entry["total"])]
+        )
+    return markdown_table(["size", "observation", "dtype", "backend", *parts, "in all"], rows)
+
+
 def learning_table() -> str:
     """The last evaluation of every run in the committed learning curves."""
     rows = []
@@ -352,6 +366,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "mutants": mutant_tables,
     "implementation_mutant_kinds": implementation_mutant_kinds,
     "implementation_mutants": implementation_mutants,
+    "preflight": preflight_table,
     "train_step": train_step_table,
     "learning": learning_table,
     "replay_image": functools.partial(replay_table, "image"),

@@ -5,7 +5,6 @@ from statistics import NormalDist
 from typing import Any
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from reference_numpy.shapes import checked, require
@@ -126,10 +125,13 @@ def convolution(x: Any, kernel: Any, bias: Any, stride: int) -> Array:
     height, width = x.shape[-3:-1]
     padded = np.zeros((*x.shape[:-3], before + height + after, before + width + after, x.shape[-1]))
     padded[..., before : before + height, before : before + width, :] = x
-    windows = sliding_window_view(padded, (KERNEL, KERNEL), axis=(-3, -2))[..., ::stride, ::stride, :, :, :]
-    windows = np.moveaxis(windows, -3, -1)  # [..., H/stride, W/stride, 5, 5, in]
-    seen = KERNEL * KERNEL * x.shape[-1]
-    return windows.reshape(*windows.shape[:-3], seen) @ kernel.reshape(seen, len(bias)) + bias
+    result = np.zeros((*x.shape[:-3], height // stride, width // stride, len(bias)))
+    for row in range(KERNEL):
+        for column in range(KERNEL):
+            result += (
+                padded[..., row : row + height : stride, column : column + width : stride, :] @ kernel[row, column]
+            )
+    return result + bias
 
 
 def transposed_convolution(x: Any, kernel: Any, bias: Any) -> Array:

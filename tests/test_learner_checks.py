@@ -128,12 +128,44 @@ class OptionsOfTheFirst(Learner):
         super().__init__(spaces, type(self).first, **options)
 
 
+class CountsItsCalls(Learner):
+    """Its random numbers depend on what else it was asked."""
+
+    calls = 0
+
+    def policy(self, *arguments: Any, **options: Any) -> Any:
+        self.calls += 1
+        return super().policy(*arguments, **options)
+
+    def train_step(self, batch: Any, seed: int) -> Any:
+        return super().train_step(batch, seed + self.calls)
+
+
+class MomentumOfNaN(Learner):
+    """Leaves out the update, and keeps what it has of the gradient."""
+
+    def train_step(self, batch: Any, seed: int) -> Any:
+        metrics, latents = super().train_step(batch, seed)
+        if metrics["skipped"]:
+            self._momentum += 1
+        return metrics, latents
+
+
+class StopsForever(Learner):
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        stopped = self._stopped
+        super().load_state_dict(state)
+        self._stopped = stopped
+
+
 MISTAKES = {
     "train_steps_match": (SlowCriticFirst, RangeForgotten, MomentsFromOne, OptionsOfTheFirst),
     "fresh_parameters_have_their_distribution": (OneKernelForTwo,),
     "acting_leaves_its_carry_as_it_was": (ResetsTheCarryItGets,),
     "acting_uses_the_newest_parameters": (StaleActing, StaleAfterLoading),
     "a_state_is_everything": (Forgetful, Shared),
+    "looking_changes_nothing": (CountsItsCalls,),
+    "a_step_that_is_not_finite_changes_nothing": (MomentumOfNaN, StopsForever),
     "noise_is_independent": tuple(
         map(changed, (as_before, posterior_for_the_prior, one_row, one_horizon, opposite_rows, one_latent))
     ),

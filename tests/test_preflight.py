@@ -17,6 +17,7 @@ from impl_torch.rssm import freeze
 from reference_numpy import layers
 from spec import Config, Discrete, Image, Spaces, Vector, load_config
 
+PARTS = {"networks", "losses and gradient", "learner", "batch"}
 SPACES = Spaces({"position": Vector(3), "image": Image(16, 16, 1)}, {"move": Vector(2), "button": Discrete((3,))})
 
 
@@ -49,6 +50,7 @@ def test_a_right_backend_passes(dtype: str) -> None:
     assert all(one.requirements and 0 <= one.share <= 1 for one in report.comparisons)
     assert any(name.startswith("gradient of every tensor") for name in named) is (dtype == "bfloat16")
     assert {"NET-2", "NET-12"} <= set(named["encoder"].requirements)
+    assert report.seconds.keys() == ({"networks", "gradient"} if dtype == "bfloat16" else PARTS)
     assert len({one.share for one in report.comparisons}) > 5, "each has a share of its own"
     reference = preflight("numpy", SPACES, config(dtype))
     assert reference.passed
@@ -147,9 +149,11 @@ def test_a_mistake_of_the_learner_is_seen() -> None:
 
 
 def test_a_batch_has_as_many_rows_as_take_seconds() -> None:
-    """All of a small network; of a large one at least 512 steps."""
-    assert module.rows_of_batch(SPACES, load_config("paper", "tiny")) == 16
-    large = load_config("paper", "400m")
+    """All of a small network; of a large one, or with images, at least 512 steps."""
+    small, large = load_config("paper", "tiny"), load_config("paper", "400m")
+    vectors = Spaces({"position": Vector(3)}, SPACES.actions)
+    assert [module.rows_of_batch(spaces, small) for spaces in (vectors, SPACES)] == [16, 8]
+    assert module.rows_of_batch(vectors, large) == 8
     assert module.rows_of_batch(SPACES, large) == 8
     assert module.rows_of_batch(SPACES, dataclasses.replace(large, batch_length=100)) == 6
     assert module.rows_of_batch(SPACES, dataclasses.replace(large, batch_size=2)) == 2

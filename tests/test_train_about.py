@@ -19,7 +19,7 @@ SPACES = Spaces({"observation": Vector(4)}, {"action": Discrete((2,))})
 
 
 def write(options: Options, resumed_at: int | None = None) -> dict[str, Any]:
-    report = Report(True, 1e-7, "all agree", [Agreement("encoder", ["NET-2"], 0.25)])
+    report = Report(True, 1e-7, "all agree", [Agreement("encoder", ["NET-2"], 0.25)], {"networks": 0.5})
     return write_about(options, spaces=SPACES, device="cpu", parameters=123, preflight=report, resumed_at=resumed_at)
 
 
@@ -87,7 +87,8 @@ def test_run_json_says_everything(tmp_path: Path) -> None:
     assert about["hyperparameters"]["batch_length"] == 32
     assert about["changed_hyperparameters"]["batch_length"] == 32
     comparison = {"name": "encoder", "requirements": ["NET-2"], "share": 0.25}
-    assert about["preflight"] == {"passed": True, "worst": 1e-7, "summary": "all agree", "comparisons": [comparison]}
+    found = {"passed": True, "worst": 1e-7, "summary": "all agree", "comparisons": [comparison]}
+    assert about["preflight"] == {**found, "seconds": {"networks": 0.5}}
     assert about["spaces"]["actions"] == {"action": {"kind": "discrete", "classes": [2]}}
     assert {"processor", "cores", "memory_gib", "system", "accelerator", "python", "versions", "commit"} <= about[
         "machine"

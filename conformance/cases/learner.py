@@ -226,6 +226,42 @@ def a_state_is_everything(script: Script) -> None:
         script.holds(f"a train step changes {part}...", any(name.startswith(part) for name in moved))
 
 
+@script("LOOP-18", "LOOP-25", uses=["Learner"], level=3)
+def looking_changes_nothing(script: Script) -> None:
+    """A learner that acts, and that shows its noise and its state, trains on like one that does not, bit for bit."""
+    problem = small_problem(script)
+    quiet, asked = made(script, problem), made(script, problem)
+    observation = random_observations(np.random.default_rng(1), problem.spaces, (ROWS,))
+    carry, is_first = asked.initial_carry(ROWS), np.ones(ROWS, bool)
+    for seed in (1, 2):
+        for learner in (quiet, asked):
+            learner.train_step(problem.batch, seed)
+        carry = asked.policy(observation, is_first, carry, seed)[2]
+        asked.policy(observation, ~is_first, carry, 7)
+        asked.policy_noise(ROWS, 8), asked.train_noise(problem.batch, 9), asked.state_dict()
+    script.compare("the state", asked.state_dict(), quiet.state_dict(), magnitude=1.0, bound=0.0)
+
+
+@script("LOOP-40", uses=["Learner"], level=3)
+def a_step_that_is_not_finite_changes_nothing(script: Script) -> None:
+    """A NaN among the rewards of the batch leaves the whole state as it was and is counted; a learner that has taken
+    over a state goes on."""
+    problem = small_problem(script)
+    learner = made(script, problem)
+    learner.train_step(problem.batch, 1)
+    before = {name: np.array(value) for name, value in learner.state_dict().items()}
+    reward = np.array(problem.batch["reward"])
+    reward[-1, -1] = np.nan
+    metrics, _ = learner.train_step({**problem.batch, "reward": reward}, 2)
+    script.exact("skipped", float(metrics["skipped"]), 1.0)
+    script.compare("the state after it", learner.state_dict(), before, magnitude=1.0, bound=0.0)
+    learner.load_state_dict(before)
+    metrics, _ = learner.train_step(problem.batch, 3)
+    script.exact("skipped, of a step with finite numbers", float(metrics["skipped"]), 0.0)
+    after = learner.state_dict()
+    script.holds("it goes on", any(not np.array_equal(after[name], value) for name, value in before.items()))
+
+
 def numbers_of(noise: dict[str, np.ndarray], task: Spaces) -> Iterator[tuple[str, np.ndarray, bool]]:
     """Each kind of number of a train step's noise, and whether it is uniform."""
     yield "posterior", noise["posterior"], True

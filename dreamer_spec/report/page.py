@@ -81,13 +81,15 @@ def _run(run: RunLog) -> dict[str, Any]:
 
 
 def _preflight(found: dict[str, Any]) -> dict[str, Any]:
-    """comparisons: what was compared, requirements, outcome, and the deviation as a share of what is allowed."""
+    """comparisons: what was compared, requirements, outcome, and the deviation as a share of what is allowed. seconds:
+    of each part."""
     worst, comparisons = found.get("worst"), found.get("comparisons")
     entries = comparisons if isinstance(comparisons, list) else []
     return found and {
         "passed": found.get("passed") is True,
         "summary": show(found.get("summary")),
         "deviation": f"{worst:.3g}" if isinstance(worst, int | float) else "",
+        "seconds": ", ".join(f"{show(part)} {show(value)} s" for part, value in _entries(found.get("seconds"))),
         "comparisons": [_comparison(entry) for entry in entries if isinstance(entry, dict)],
     }
 
