@@ -14,7 +14,7 @@ from conformance.adapter import OBJECTS
 from conformance.adapters.numpy_adapter import NumpyAdapter
 from conformance.case import Call, Equal, Refused, Setting
 from conformance.check import Check
-from conformance.compare import Comparisons, Unjudged
+from conformance.compare import Comparisons, Unjudged, entries
 from conformance.drawing import cases
 from conformance.execute import FAILING, outcome, run
 from conformance.judge import Ask, asking, judge_case, standing_in
@@ -215,12 +215,25 @@ def same(answer: Answer, noted: Answer, setting: Setting, any_error: bool = Fals
     try:
         if demand is None or demand.bound == 0:
             return _agree(ruler, answer.result, noted.result, bound)
-        # Both may err by what the check allows.
-        how = {"magnitude": demand.magnitude, "factor": 2 * demand.factor, "bound": demand.bound}
-        ruler.compare("", answer.result, noted.result, **how)
+        # Both may err by what the check allows. Wrong numbers may be larger than right ones, and their rounding with
+        # them.
+        magnitude = _at_least(demand.magnitude, noted.result)
+        ruler.compare(
+            "", answer.result, noted.result, magnitude=magnitude, factor=2 * demand.factor, bound=demand.bound
+        )
     except Exception:  # whatever a candidate may return where numbers are expected
         return False
     return True
+
+
+def _at_least(magnitude: Any, result: Any) -> Any:
+    """What rounding is relative to, as `compare` takes it, and no less than the numbers of the result."""
+    if magnitude is None or isinstance(magnitude, str):
+        return magnitude
+    if isinstance(result, Mapping | tuple | list):
+        parts = magnitude if isinstance(magnitude, Mapping | tuple) else dict.fromkeys(entries(result), magnitude)
+        return {key: _at_least(parts[key], result[key]) for key in entries(result)}
+    return np.fmax(magnitude, np.abs(result))
 
 
 def _is_data(result: Any) -> bool:

@@ -78,6 +78,18 @@ def test_a_missing_gradient_in_a_backend_is_named(monkeypatch: pytest.MonkeyPatc
     assert (found.mutant.name, found.alternatives, found.unexplained) == ("kl_stop_gradients_swapped", (), ())
 
 
+def test_wrong_numbers_may_be_rounded_as_their_own_size_asks() -> None:
+    """Divergences without a mixture reach thousands of nats, next to tens of those that the check expects."""
+
+    class Rounded:
+        def kl_losses(self, *arguments: Any) -> Any:
+            exact = MutantAdapter(MUTANTS["kl_without_unimix"]).kl_losses(*arguments)
+            return tuple(loss.astype(np.float32).astype(np.float64) * (1 + 1e-7) for loss in exact)
+
+    first, *_ = diagnose_in(Rounded(), "world_model.kl_matches", dtype="float32")
+    assert "kl_without_unimix" in [mutant.name for mutant in (first.mutant, *first.alternatives)]
+
+
 def test_two_mistakes_are_both_named() -> None:
     both = PlantedAdapter({**MUTANTS["return_without_continue"].replacements, **MUTANTS["clip_by_unit"].replacements})
     found = diagnose_in(both, "returns.lambda", "optimizer.clip")

@@ -310,7 +310,7 @@ def policies(outputs, spaces, config):
 
 def action_log_prob(outputs, action, spaces, config):
     every = list(policies(outputs, spaces, config))
-    parts = action.float().split([size for _, size in every], -1)
+    parts = action.detach().float().split([size for _, size in every], -1)  # as their training step hands it
     return sum(one.log_prob(part) for (one, _), part in zip(every, parts, strict=True))
 
 

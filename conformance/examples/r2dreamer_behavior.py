@@ -30,6 +30,11 @@ def every(number):
     return lambda states: Namespace(mode=lambda: number.expand(*states.shape[:2], 1))
 
 
+def predicting(logits):
+    """A critic with these logits at every state."""
+    return lambda states: distributions.symexp_twohot(logits.expand(*states.shape[:2], -1), len(logits))
+
+
 def pass_of(imagined, replayed, returns=None, scale=1.0, is_last=None, **given):
     """The metrics of `_cal_grad` where the world model is nothing.
 
@@ -125,7 +130,11 @@ def regularized(loss_of, logits, slow_logits, returns, entries, config):
 def critic_loss(logits, slow_logits, returns, weight, config):
     def loss(logits, slow_logits, returns, weight):
         states = torch.cat([logits, slow_logits]).expand(2, 2, -1)
-        given = {"_frozen_cont": lambda states: Namespace(mean=weight.expand(2, 2, 1))}
+        given = {
+            "value": predicting(logits),  # the states lose their gradients on the way
+            "_frozen_slow_value": predicting(slow_logits),
+            "_frozen_cont": lambda states: Namespace(mean=weight.expand(2, 2, 1)),
+        }
         return pass_of(states, states[:1], returns, **given)["loss/value"]
 
     return regularized(loss, logits, slow_logits, returns, weight, config)

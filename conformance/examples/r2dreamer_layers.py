@@ -6,6 +6,7 @@ import networks
 from r2dreamer_agent import fill
 from r2dreamer_networks import block_of, mlp_of, mlp_options, with_epsilon
 from torch import nn
+from torch.func import functional_call
 
 
 def run(module, tensors, *inputs):
@@ -24,7 +25,8 @@ def block_linear(x, kernel, bias):
 
 
 def rms_norm(x, scale, epsilon):
-    return run(nn.RMSNorm(len(scale), eps=epsilon), [scale], x)
+    """With the scale itself in place of the parameter, so that its gradient is seen."""
+    return functional_call(nn.RMSNorm(len(scale), eps=epsilon), {"weight": scale}, x)
 
 
 def silu(x):

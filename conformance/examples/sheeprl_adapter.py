@@ -33,7 +33,6 @@ ALONE = Namespace(all_gather=lambda x: x)  # a Fabric of one process
 
 def setup(dtype):
     Distribution.set_default_validate_args(False)  # as their command line does
-    torch.set_grad_enabled(False)
 
 
 def edition():

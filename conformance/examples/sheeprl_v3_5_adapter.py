@@ -232,7 +232,7 @@ def policies(outputs, spaces, config):
 
 
 def action_log_prob(outputs, action, spaces, config):
-    total = 0
+    total, action = 0, action.detach()  # drawn in `imagine`, which runs without gradients
     for policy, state, sizes, first in policies(outputs, spaces, config):
         parts = action[..., first : first + sum(sizes)].split(sizes, -1)
         total = total + sum(one.log_prob(part) for one, part in zip(policy.distributions(state), parts, strict=True))
@@ -278,9 +278,7 @@ def one_kl(posterior_logits, prior_logits, config, share):
         continue_model=lambda states: zero,
     )
     scales = {
-        "observation_scale": 1.0,
-        "reward_scale": 1.0,
-        "continue_scale": 1.0,
+        **dict.fromkeys(("observation_scale", "reward_scale", "continue_scale"), 0.0),
         "dynamic_scale": share,
         "representation_scale": 1 - share,
     }
@@ -292,10 +290,9 @@ def one_kl(posterior_logits, prior_logits, config, share):
         "replay_grad": True,
         "entropies": False,
     }
-    metrics = dreamer_v3_5.world_model_loss(
+    return dreamer_v3_5.world_model_loss(
         model, {"x": zero}, zero, zero, zero, zero, zero, zero, **keys, **rest, **scales
-    )[-1]
-    return metrics["Loss/state_loss"]
+    )[0]
 
 
 def lambda_return(reward, continue_, value, discount, lambda_):
@@ -322,7 +319,8 @@ def cumulative_weights(continue_, discount):
     return dreamer_v3_5.imagine(model, lambda states: ([zero], None), critic, critic, zero, zero, **sizes)[-1][:-1].mT
 
 
-def behavior_losses(
+def behavior_loss(
+    part,
     actor=None,
     imagined=None,
     actions=None,
@@ -333,21 +331,18 @@ def behavior_losses(
     scale=1.0,
     **given,
 ):
-    """Metrics of `actor_critic_loss` for one imagined state. A state is the logits of the critic, then those of the
-    slow critic."""
+    """A part of `actor_critic_loss` for one imagined state: "policy", "value" or "replay_value".
+
+    A state is the logits of the critic, then those of the slow critic. What `imagine` computes comes without gradients,
+    as there.
+    """
     empty = torch.zeros(2, 1, 2 * 255) if imagined is None else imagined
     bins = empty.shape[-1] // 2
     pair = torch.zeros(2, 1)
     policy = Namespace(log_prob=lambda action: pair[:1], entropy=lambda: pair[:1]) if actor is None else actor
     rest = {"ent_coef": 0.0, "slow_regularizer": 1.0, "replay_loss": False, **given}
-    sizes = {
-        "actions_dim": (1,),
-        "gamma": 1.0,
-        "lmbda": 1.0,
-        "policy_scale": 1.0,
-        "value_scale": 1.0,
-        "replay_value_scale": 1.0,
-    }
+    sizes = {"actions_dim": (1,), "gamma": 1.0, "lmbda": 1.0}
+    scales = {f"{name}_scale": float(name == part) for name in ("policy", "value", "replay_value")}
     replayed = {name: rest.pop(name, pair) for name in ("latent_states", "last", "terminated", "rewards")}
     return dreamer_v3_5.actor_critic_loss(
         lambda states, with_actions: ((), (policy,)),
@@ -355,14 +350,15 @@ def behavior_losses(
         lambda states: states[..., bins:],
         empty,
         torch.zeros(2, 1, 1),
-        *(pair if x is None else x for x in (values, slow_values)),
-        pair[:1] if returns is None else returns,
-        pair if weight is None else weight,
-        torch.as_tensor(scale, dtype=torch.float32),
+        *(pair if x is None else x.detach() for x in (values, slow_values)),
+        pair[:1] if returns is None else returns.detach(),
+        pair if weight is None else weight.detach(),
+        torch.as_tensor(scale, dtype=torch.float32).detach(),
         *replayed.values(),
         **sizes,
+        **scales,
         **rest,
-    )[1]
+    )[0]
 
 
 def twice(x):
@@ -381,7 +377,7 @@ def actor_loss(log_prob, entropy, returns, value, weight, scale, config):
             "scale": scale,
             "ent_coef": config.entropy_scale,
         }
-        losses.append(behavior_losses(policy, **given)["Loss/policy_loss"])
+        losses.append(behavior_loss("policy", policy, **given))
     return torch.stack(losses).reshape(returns.shape)
 
 
@@ -392,9 +388,7 @@ def critic_loss(logits, slow_logits, returns, weight, config):
         logit, slow, slow_value, target, w = rows
         states = torch.cat([logit, slow]).expand(2, 1, -1)
         given = {"slow_values": twice(slow_value), "returns": target.reshape(1, 1), "weight": twice(w)}
-        losses.append(
-            behavior_losses(imagined=states, slow_regularizer=config.slow_critic_scale, **given)["Loss/value_loss"]
-        )
+        losses.append(behavior_loss("value", imagined=states, slow_regularizer=config.slow_critic_scale, **given))
     return torch.stack(losses).reshape(returns.shape)
 
 
@@ -413,10 +407,8 @@ def replay_critic_loss(logits, slow_logits, returns, is_last, config):
         }
         imagined = {"imagined": states.expand(2, 2, -1), "values": torch.zeros(2, 2), "slow_values": torch.zeros(2, 2)}
         weights = {"returns": torch.zeros(1, 2), "weight": torch.zeros(2, 2)}
-        metrics = behavior_losses(
-            **imagined, **weights, replay_loss=True, slow_regularizer=config.slow_critic_scale, **given
-        )
-        losses.append(metrics["Loss/replay_value_loss"])
+        options = {"replay_loss": True, "slow_regularizer": config.slow_critic_scale}
+        losses.append(behavior_loss("replay_value", **imagined, **weights, **options, **given))
     return torch.stack(losses).reshape(returns.shape)
 
 

@@ -9,6 +9,7 @@ their encoder without symlog.
 import torch
 from sheeprl.algos.dreamer_v3_5 import agent
 from sheeprl.utils.utils import symlog
+from torch.func import functional_call
 
 __all__ = [
     "block_linear",
@@ -27,9 +28,10 @@ __all__ = [
 
 def fill(module, tensors):
     """The module with these tensors as its parameters, in their order."""
-    for parameter, tensor in zip(module.parameters(), tensors, strict=True):
-        assert parameter.shape == tensor.shape, (parameter.shape, tensor.shape)
-        parameter.copy_(tensor)
+    with torch.no_grad():
+        for parameter, tensor in zip(module.parameters(), tensors, strict=True):
+            assert parameter.shape == tensor.shape, (parameter.shape, tensor.shape)
+            parameter.copy_(tensor)
     return module
 
 
@@ -60,7 +62,8 @@ def block_linear(x, kernel, bias):
 
 
 def rms_norm(x, scale, epsilon):
-    return fill(agent.RMSNorm(len(scale), epsilon), [scale])(x)
+    """With the scale itself in place of the parameter, so that its gradient is seen."""
+    return functional_call(agent.RMSNorm(len(scale), epsilon), {"weight": scale}, x)
 
 
 def max_pool(x):
