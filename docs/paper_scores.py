@@ -18,7 +18,9 @@ from pathlib import Path
 from docs.latex_tables import LatexTable, number, read_tables
 
 FOLDER = Path(__file__).resolve().parent.parent / "spec" / "scores"
-HEADER = "# Made of the paper's LaTeX source by `python -m docs.paper_scores`; do not edit. Missing entries are empty.\n"
+HEADER = (
+    "# Made of the paper's LaTeX source by `python -m docs.paper_scores`; do not edit. Missing entries are empty.\n"
+)
 DOMAINS = ("ball_in_cup",)  # those of the control suite that are more than one word
 Rows = list[list[str]]
 

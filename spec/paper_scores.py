@@ -57,7 +57,9 @@ def paper_tables() -> dict[str, PaperTable]:
     return {
         suite: PaperTable(
             suite=suite,
-            methods=tuple(Method(row["column"], row["method"], row["steps"]) for row in methods if row["suite"] == suite),
+            methods=tuple(
+                Method(row["column"], row["method"], row["steps"]) for row in methods if row["suite"] == suite
+            ),
             scores=_numbers(suite, "task"),
             printed={} if suite == "minecraft" else _numbers(f"{suite}-aggregates", "aggregate"),
             misprints={row["printed"]: row["means"] for row in misprints if row["suite"] == suite},

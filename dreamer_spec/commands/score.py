@@ -80,10 +80,12 @@ def _parser() -> Parser:
         "--window",
         type=_share,
         metavar="SHARE",
-        help="of the budget, at its end, whose episodes count (default: that of the paper's table for each suite, 0.01 to "
-        "0.04, and 0.05 for other tasks)",
+        help="of the budget, at its end, whose episodes count (default: that of the paper's table for each suite, "
+        "0.01 to 0.05, and 0.05 for other tasks)",
     )
-    parser.add_argument("--episodes", choices=EPISODES, default="training", help="which returns count (default training)")
+    parser.add_argument(
+        "--episodes", choices=EPISODES, default="training", help="which returns count (default training)"
+    )
     parser.add_argument("--markdown", type=Path, metavar="FILE", help="write tables and statement for a page")
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write a row for each task and summary")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write everything, every run included")
@@ -109,9 +111,7 @@ def _picture(text: str) -> Path:
     return Path(text)
 
 
-def _print(
-    console: Console, suites: Sequence[SuiteScore], scores: Sequence[RunScore], about: Statement
-) -> None:
+def _print(console: Console, suites: Sequence[SuiteScore], scores: Sequence[RunScore], about: Statement) -> None:
     for suite in suites:
         console.print(f"\n{cells.title(suite)}", style="bold", soft_wrap=True)
         for found in (cells.task_cells(suite), cells.summary_cells(suite)):

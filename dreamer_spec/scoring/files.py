@@ -43,7 +43,18 @@ def as_csv(suites: Sequence[SuiteScore], scores: Sequence[RunScore], about: Stat
     comments = [f"{topic}: {'; '.join(said)}" for topic, said in statement_lines(about)]
     comments += [f"Remark: {remark}" for remark in remarks(suites, scores)]
     columns = list(dict.fromkeys(f"paper_{method.column}" for suite in suites for method in suite.methods))
-    own = ["suite", "kind", "name", "value", "low", "high", "standard_deviation", "runs", "returns", "normalized_percent"]
+    own = [
+        "suite",
+        "kind",
+        "name",
+        "value",
+        "low",
+        "high",
+        "standard_deviation",
+        "runs",
+        "returns",
+        "normalized_percent",
+    ]
     rows: list[dict[str, Any]] = []
     for suite in suites:
         rows += [{"suite": suite.suite, "kind": "task", **_task_row(task)} for task in suite.tasks]

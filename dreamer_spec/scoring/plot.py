@@ -18,7 +18,6 @@ from spec.paper_scores import paper_tables
 
 BINS = 50
 COLUMNS = 6  # of pictures beside each other
-FORMATS = (".png", ".pdf", ".svg")
 
 
 def draw(scores: Sequence[RunScore], protocol: Protocol, path: Path) -> None:
@@ -56,8 +55,8 @@ def _draw_task(axes: Axes, suite: str, task: str, runs: Sequence[RunLog], metric
 
 
 def mean_curve(curves: Sequence[Curve], end: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Middle of each bin of the steps 0 to `end`, mean over runs of their means in it, and the standard deviation (n - 1)
-    of these; 0 for a single run. A bin in which no run has a return is left out: [n] each."""
+    """Middle of each bin of the steps 0 to `end`, mean over runs of their means in it, and the standard deviation
+    (n - 1) of these; 0 for a single run. A bin in which no run has a return is left out: [n] each."""
     sums, counts = np.zeros((len(curves), BINS)), np.zeros((len(curves), BINS))
     for row, curve in enumerate(curves):
         finite = np.isfinite(curve.values)

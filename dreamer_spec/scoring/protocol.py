@@ -12,8 +12,8 @@ EPISODES = {"training": "episode/return", "evaluation": "evaluation/return"}
 
 @dataclasses.dataclass(frozen=True)
 class Protocol:
-    """window: the share of the budget at its end that counts, above 0 and at most 1; None for that of the paper's tables
-    for each suite. episodes: `training` or `evaluation`."""
+    """window: the share of the budget at its end that counts, above 0 and at most 1; None for that of the paper's
+    tables for each suite. episodes: `training` or `evaluation`."""
 
     window: float | None = None
     episodes: str = "training"
@@ -76,7 +76,8 @@ def score_run(run: RunLog, protocol: Protocol) -> RunScore:
 
 
 def _last_round(run: RunLog) -> int:
-    """How far beyond its budget the last step of all environments can bring a run."""
+    """How many steps beyond its budget a run can end, because all its environments step at once."""
     environments, repeat = run.hyperparameters.get("envs"), run.options.get("action_repeat")
-    known = isinstance(environments, int) and isinstance(repeat, int)
-    return max(environments * repeat - 1, 0) if known else 0
+    if not isinstance(environments, int) or not isinstance(repeat, int):
+        return 0
+    return max(environments * repeat - 1, 0)

@@ -9,8 +9,10 @@ from dreamer_spec.report.runs import RunLog, show
 from dreamer_spec.scoring import statistics
 from dreamer_spec.scoring.protocol import Protocol, RunScore
 from dreamer_spec.system.machine import own_version
+from dreamer_spec.words import counted
 
 SHOWN_VERSIONS = ("dreamer-spec", "numpy", "jax", "torch", "gymnasium", "dm-control", "mujoco", "ale-py")
+FEW = 5  # tasks that are named rather than counted
 
 Statement = dict[str, str | list[str]]
 
@@ -19,7 +21,7 @@ def statement(scores: Sequence[RunScore], protocol: Protocol, command: str) -> S
     """By topic, in words. command: that of the scores themselves."""
     runs = [score.run for score in scores]
     return {
-        "protocol": _protocol(scores, protocol),
+        "protocol": _protocol(protocol),
         "window": _distinct(_window(score, protocol) for score in scores),
         "episodes": _episodes(scores, protocol),
         "seeds": _seeds(runs),
@@ -33,11 +35,12 @@ def statement(scores: Sequence[RunScore], protocol: Protocol, command: str) -> S
     }
 
 
-def _protocol(scores: Sequence[RunScore], protocol: Protocol) -> str:
+def _protocol(protocol: Protocol) -> str:
     what = "training episodes that ended" if protocol.episodes == "training" else "evaluations that were made"
-    whose = "at the end of the budget; that of the paper's tables for each suite (docs/scores.md)"
-    own = f"in the last {protocol.window:.3g} of the budget" if protocol.window is not None else f"in the window {whose}"
-    return f"mean return of the {what} {own}; then the mean over seeds, then normalization, then over tasks"
+    return (
+        f"mean return of the {what} in the window; then the mean over seeds, then normalization, then summaries over "
+        f"tasks (docs/scores.md)"
+    )
 
 
 def _window(score: RunScore, protocol: Protocol) -> str:
@@ -55,19 +58,28 @@ def _episodes(scores: Sequence[RunScore], protocol: Protocol) -> str:
 
 
 def _seeds(runs: Sequence[RunLog]) -> list[str]:
-    """The seeds of each task; tasks that have the same ones are taken together."""
-    seeds = {task: [show(run.seed) or "unknown" for run in runs if run.task == task] for task in _distinct(r.task for r in runs)}
+    """Of all tasks, or, if tasks differ, of each set of them that has the same seeds."""
+    seeds: dict[str, list[str]] = {}
+    for run in runs:
+        seeds.setdefault(run.task, []).append(show(run.seed) or "unknown")
     together: dict[str, list[str]] = {}
     for task, own in seeds.items():
         together.setdefault(", ".join(sorted(own, key=lambda seed: (len(seed), seed))), []).append(task)
     if len(together) == 1:
         return list(together)
-    return [f"{own}: {', '.join(tasks)}" for own, tasks in together.items()]
+    named = {
+        own: ", ".join(tasks) if len(tasks) <= FEW else counted(len(tasks), "task") for own, tasks in together.items()
+    }
+    return [f"{own} ({tasks})" for own, tasks in named.items()]
 
 
 def _machine(run: RunLog) -> str:
     parts = [show(run.machine.get("processor")), _counted(run.machine.get("cores"), "cores")]
-    parts += [_counted(run.machine.get("memory_gib"), "GiB"), show(run.machine.get("accelerator")), show(run.machine.get("system"))]
+    parts += [
+        _counted(run.machine.get("memory_gib"), "GiB"),
+        show(run.machine.get("accelerator")),
+        show(run.machine.get("system")),
+    ]
     where = ", ".join(part for part in parts if part) or "unknown machine"
     return f"{where}; {run.backend or 'unknown backend'} on {run.device or 'an unknown device'}"
 

@@ -39,7 +39,7 @@ def summarize(summary: Summary, tasks: Sequence[str], scores: Scores) -> np.ndar
     if summary.statistic == "iqm":
         return interquartile_mean(summary.normalized(tasks, scores))
     of_tasks = np.stack(summary.normalized(tasks, [np.mean(runs, axis=-1) for runs in scores]), axis=-1)
-    return {"mean": np.mean, "median": np.median}[summary.statistic](of_tasks, axis=-1)
+    return np.mean(of_tasks, axis=-1) if summary.statistic == "mean" else np.median(of_tasks, axis=-1)
 
 
 def interquartile_mean(scores: Scores) -> np.ndarray:

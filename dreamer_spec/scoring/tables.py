@@ -72,7 +72,7 @@ def _suite(suite: str, scores: Sequence[RunScore]) -> SuiteScore:
     tasks = tuple(_task(name, scores, first, _floats(table.scores[name])) for name in names)
     complete = len(names) == len(table.scores)
     summaries = tuple(_summary(summary, table, tasks, complete) for summary in SUMMARIES[suite]) if tasks else ()
-    notes = [*_differences([score.run for score in scores]), *_against_the_paper(suite, scores)]
+    notes = [*_differences([score.run for score in scores]), *_against_the_paper(suite, scores), *_single(tasks)]
     return SuiteScore(suite, len(table.scores), table.methods, tasks, summaries, tuple(notes))
 
 
@@ -139,6 +139,14 @@ def _differences(runs: Sequence[RunLog]) -> list[str]:
     pairs = [(run.task, run.seed) for run in runs]
     twice = [f"{task} with seed {seed}" for task, seed in dict.fromkeys(pairs) if pairs.count((task, seed)) > 1]
     return notes + ([f"more than one run of {', '.join(twice)}"] if twice else [])
+
+
+def _single(tasks: Sequence[TaskScore]) -> list[str]:
+    """Tasks with one run among others, of which the intervals cannot know how much they vary."""
+    single = [task.task for task in tasks if len(task.runs) == 1]
+    if not single or len(single) == len(tasks):
+        return []
+    return [f"the intervals are too narrow, because these tasks have one run: {', '.join(single)}"]
 
 
 def _against_the_paper(suite: str, scores: Sequence[RunScore]) -> list[str]:
