@@ -155,9 +155,9 @@ def test_the_episodes_in_the_window_count(tmp_path: Path) -> None:
 
 
 def test_the_last_round_of_all_environments_counts(tmp_path: Path) -> None:
-    """Four environments with two steps an action may end at 1,006, and what is later belongs to another budget."""
-    returns = [(950.0, 1.0), (1006.0, 3.0), (1200.0, 100.0)]
-    found = run(tmp_path / "a", returns, step=1200, hyperparameters={"envs": 4})
+    """Four environments with two steps an action add 8 at once, and the last time begins below the budget."""
+    returns = [(950.0, 1.0), (1007.0, 3.0), (1008.0, 100.0)]
+    found = run(tmp_path / "a", returns, step=1008, hyperparameters={"envs": 4})
     assert (found.score, found.returns) == (2, 2)
 
 
