@@ -47,7 +47,7 @@ def _draw_task(axes: Axes, suite: str, task: str, runs: Sequence[RunLog], metric
     axes.fill_between(steps, mean - deviation, mean + deviation, color=BLUE, alpha=0.2, linewidth=0)
     if suite and (score := paper_tables()[suite].scores[task]["dreamer"]) is not None:
         axes.axhline(float(score), color=GRAY, linestyle="--", linewidth=1)
-    axes.set_title(task.replace("_", " "), fontsize=9)
+    axes.set_title(runs[0].task, fontsize=9)
     axes.set_xlim(0, max(end, 1))
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.tick_params(labelsize=7)
