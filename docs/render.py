@@ -26,7 +26,7 @@ from conformance.commands.mutants import is_named
 from conformance.mutants import implementations
 from conformance.mutants.implementations import report as mutant_report
 from conformance.requirements import chapter_of, requirements
-from docs import backends, examples, third_party
+from docs import backends, examples, score_tables, third_party
 from dreamer_spec.report import catalogue
 from spec import Edition, benchmarks, editions, hyperparameters, profiles, sizes
 
@@ -374,6 +374,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "metrics": catalogue.markdown,
     "third_party": third_party.summary_table,
     "third_party_findings": third_party.finding_sections,
+    "paper_summaries": lambda: markdown_table(*score_tables.summaries()),
+    "paper_windows": lambda: markdown_table(*score_tables.windows()),
     "loop_shares": loop_shares,
     "loop_memory": loop_memory,
     "lockstep_free": lambda: lockstep_table("free", ("float64",)),

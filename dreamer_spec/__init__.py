@@ -11,6 +11,7 @@ never from another package of its level, never in a circle. tests/test_repositor
   envs, policy, replay                         environments; a trained agent with NumPy alone; the buffer of chapter 11
   monitoring, option_table                     what people see of a run; the options as one table
   report, training                             the HTML page about runs; a run from its options to its end
+  scoring                                      final scores of runs, beside the paper's
   api, commands                                the interface from Python; the names of the commands beside training
   cli                                          the command line
   commands.*, __main__                         what each command does

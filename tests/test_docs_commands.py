@@ -49,6 +49,7 @@ SHORTER = {
 NOT_HERE = {
     "make ": "makes an environment of its own and downloads; what it calls is tested",
     "pip install": "downloads",
+    "python -m docs.paper_": "reads what is not part of the project; tests/test_paper_scores.py",
     "export ": "sets variables for the lines after it",
 }
 SLOW = (

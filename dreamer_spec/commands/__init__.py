@@ -6,4 +6,5 @@ COMMANDS: dict[str, str] = {  # name -> what it does, for --help
     "inspect": "what a train step met whose loss or gradient was not finite; what a checkpoint holds",
     "report": "one HTML page about one run or many",
     "resume": "continues a run with the options that it was started with, but for those given here",
+    "score": "final scores of runs by a stated protocol, beside the paper's",
 }

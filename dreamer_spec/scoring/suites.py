@@ -1,0 +1,92 @@
+"""The suites whose scores can be compared with the paper's: how their tasks are called, and how the paper summarizes
+them (docs/scores.md)."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from spec.paper_scores import PaperTable, paper_tables, references, windows
+
+# What stands before the colon of a task -> the suite of spec/paper_scores.py. The returns of BSuite are not its scores,
+# and the paper has no scores of Crafter: both are scored as any other task.
+NAMESPACES = {
+    "minecraft": "minecraft",
+    "atari": "atari",
+    "procgen": "procgen",
+    "dmlab": "dmlab",
+    "atari100k": "atari100k",
+    "dmc": "dmc_proprio",
+    "dmc_vision": "dmc_vision",
+}
+OTHER_WINDOW = 0.05  # the share of the budget, for tasks that the paper does not have
+
+
+@dataclasses.dataclass(frozen=True)
+class Summary:
+    """A number about all tasks of a suite.
+
+    reference: of `spec.paper_scores.references`, by which scores become per cent; empty if returns are taken as they
+    are. capped: what is above 100 % counts as 100 %; nothing is capped below. statistic: mean, median or iqm.
+    """
+
+    name: str
+    reference: str
+    capped: bool
+    statistic: str
+
+    @property
+    def unit(self) -> str:
+        return "%" if self.reference else ""
+
+    def normalized(self, tasks: Sequence[str], scores: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Returns of each task, of any shape, in per cent of the reference."""
+        return [self._normalized(task, score) for task, score in zip(tasks, scores, strict=True)]
+
+    def _normalized(self, task: str, score: np.ndarray) -> np.ndarray:
+        if not self.reference:
+            return score
+        low, high = references()[self.reference][task]
+        per_cent = 100 * (score - low) / (high - low)
+        return np.minimum(per_cent, 100) if self.capped else per_cent
+
+
+def _three(name: str, reference: str, capped: bool = False) -> tuple[Summary, ...]:
+    """human_{}_capped -> human_mean_capped, human_median_capped, human_iqm_capped"""
+    return tuple(Summary(name.format(one), reference, capped, one) for one in ("mean", "median", "iqm"))
+
+
+# The first one of a suite says how a single task is normalized.
+SUMMARIES: Mapping[str, tuple[Summary, ...]] = {
+    "minecraft": (),  # one task
+    "atari": (
+        *_three("gamer_{}", "gamer"),
+        Summary("record_mean", "record", False, "mean"),
+        Summary("record_mean_capped", "record", True, "mean"),
+    ),
+    "procgen": _three("normalized_{}", "range"),
+    "dmlab": _three("human_{}_capped", "human", capped=True),
+    "atari100k": _three("gamer_{}", "gamer"),
+    "dmc_proprio": _three("task_{}", ""),
+    "dmc_vision": _three("task_{}", ""),
+}
+
+
+def split_task(task: str) -> tuple[str, str]:
+    """dmc:walker-walk -> "dmc_proprio", "walker-walk". A task of no suite of the paper, or that its table lacks, is of
+    the suite "", under its whole name."""
+    namespace, _, name = task.partition(":")
+    suite = NAMESPACES.get(namespace, "")
+    if suite == "dmlab" and name.endswith("_train"):  # trained on one set of levels, listed under the other: D-100
+        name = name.removesuffix("_train") + "_test"
+    return (suite, name) if suite and name in paper_tables()[suite].scores else ("", task)
+
+
+def window_of(suite: str) -> float:
+    """The share of the budget at its end whose episodes are scored."""
+    return windows().get(suite, OTHER_WINDOW)
+
+
+def tasks_of(table: PaperTable, found: Sequence[str]) -> list[str]:
+    """Those of the paper's tasks that were found, in its order."""
+    return [task for task in table.scores if task in found]
