@@ -13,6 +13,7 @@ never from another package of its level, never in a circle. tests/test_repositor
   report, training                             the HTML page about runs; a run from its options to its end
   api, commands                                the interface from Python; the names of the commands beside training
   cli                                          the command line
+  sweeping                                     many runs: what they are, who runs them, how far they are
   commands.*, __main__                         what each command does
 
 From Python: docs/python.md. The names below are imported when they are asked for, so that `import dreamer_spec` costs
