@@ -118,15 +118,27 @@ def size_table() -> str:
 
 def benchmark_table() -> str:
     """Every suite; values of the profile `official` in parentheses where they differ."""
-    names = ["tasks", "steps", "action_repeat", "envs", "replay_ratio", "size", "observation"]
+    names = ["steps", "action_repeat", "envs", "replay_ratio", "size", "time_limit", "observation"]
 
     def cell(suite: dict[str, Any], name: str) -> str:
         official = suite.get("official", {})
         changed = f" ({_value(official[name])})" if name in official else ""
         return (_value(suite[name]) if name in suite else "environment's") + changed
 
-    rows = [[f"`{name}`", *(cell(suite, column) for column in names)] for name, suite in benchmarks().items()]
-    return markdown_table(["suite", *names], rows)
+    def arguments(suite: dict[str, Any]) -> str:
+        own = suite.get("env", {})
+        return ", ".join(f"`{name}` {cell({**own, 'official': _official_env(suite)}, name)}" for name in own)
+
+    rows = [
+        [f"`{name}`", str(len(suite["tasks"])), *(cell(suite, column) for column in names), arguments(suite)]
+        for name, suite in benchmarks().items()
+    ]
+    return markdown_table(["suite", "tasks", *names, "its environment"], rows)
+
+
+def _official_env(suite: dict[str, Any]) -> dict[str, Any]:
+    found: dict[str, Any] = suite.get("official", {}).get("env", {})
+    return found
 
 
 def conformance_summary() -> str:

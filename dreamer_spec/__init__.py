@@ -3,7 +3,7 @@
 The packages by level, the lowest first. A module imports from lower levels and from its own package: never from above,
 never from another package of its level, never in a circle. tests/test_repository.py reads this table and checks it.
 
-  errors, own_packages, words                  what the user can mend, in one line; how counts are said
+  errors, own_packages, suites, words          what the user can mend, in one line; how counts are said; protocols
   system                                       the process and its machine: cores, memory, threads, signals
   arguments, backend, kinds, options, resize   what a run is, and the interface to what trains
   translation                                  an environment's values as arrays, and flat actions as the environment's
@@ -14,6 +14,7 @@ never from another package of its level, never in a circle. tests/test_repositor
   scoring                                      final scores of runs, beside the paper's
   api, commands                                the interface from Python; the names of the commands beside training
   cli                                          the command line
+  sweeping                                     many runs: what they are, who runs them, how far they are
   commands.*, __main__                         what each command does
 
 From Python: docs/python.md. The names below are imported when they are asked for, so that `import dreamer_spec` costs

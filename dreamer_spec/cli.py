@@ -37,7 +37,7 @@ DESCRIPTION = """Train a DreamerV3 agent.
 
   train --backend jax                                            the default task, in minutes
   train --backend torch --task gym:Acrobot-v1 --size tiny        any Gymnasium id
-  train --backend jax --preset dmc_proprio --task dmc:cheetah-run    the paper's protocol
+  train --backend jax --task dmc:cheetah-run                     the paper's protocol; `train tasks` lists suites
   train --backend jax --task my_module:make_env --preset laptop  your own: a function that returns a gymnasium.Env
 
 The same command again continues the run in its log directory. Commands for what it leaves there:

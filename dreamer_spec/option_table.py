@@ -137,7 +137,7 @@ RUN_OPTIONS = {
         Option(
             "task",
             text("SUITE:NAME"),
-            "gym:ID, dmc:DOMAIN-TASK (vectors), dmc_vision:DOMAIN-TASK (images) or MODULE:CALLABLE",
+            "a task of a suite, played by its protocol (`train tasks` lists them), gym:ID or MODULE:CALLABLE",
         ),
         Option("size", choice(sizes(), "SIZE"), f"model size: {', '.join(sizes())}"),
         Option("profile", choice(profiles(), "PROFILE"), f"{', '.join(built_profiles())}; see docs/editions.md"),

@@ -1,4 +1,5 @@
-"""What a run is: its options, made of [base], a preset and the command line, later ones winning."""
+"""What a run is: its options, made of [base], the suite of its task, a preset and the command line, later ones
+winning."""
 
 import dataclasses
 import difflib
@@ -10,6 +11,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from dreamer_spec import suites
 from dreamer_spec.errors import UserError
 from spec import Config, built_profiles, hyperparameters, load_config
 
@@ -128,8 +130,12 @@ def assemble_options(
     settings = {**presets()["base"], **chosen, **given}
     if "task" not in settings:
         raise UserError(f"the preset {preset} is for any task: name yours, --task MODULE:CALLABLE or SUITE:NAME")
-    overrides = {**chosen.get("hyperparameters", {}), **changed}
-    profile = settings.pop("profile")
+    profile = settings["profile"]
+    of_suite = suites.settings(settings["task"], profile)
+    settings = {**presets()["base"], **of_suite, **chosen, **given}
+    settings["env_arg"] = {**of_suite.get("env_arg", {}), **settings.get("env_arg", {})}
+    overrides = {**of_suite.get("hyperparameters", {}), **chosen.get("hyperparameters", {}), **changed}
+    del settings["profile"]
     try:
         config = load_config(profile, settings.pop("size"), **overrides)
     except ValueError as error:
@@ -163,4 +169,4 @@ def of_seeds(options: Options, seeds: Sequence[int], logdir_given: bool) -> list
 def names_code(task: str) -> bool:
     """Whether a task is a module of somebody, whose code would run, and not one of a suite."""
     suite, _, name = task.partition(":")
-    return suite not in ("gym", "dmc", "dmc_vision") or ":" in name
+    return suite not in ("gym", *suites.SUITES) or ":" in name

@@ -38,6 +38,7 @@ SHORTER = {
     "train --": TRAIN,
     "train resume": "--steps 710",
     "train eval": "--episodes 2",
+    "train sweep": "--dry-run",
     "conformance check": "--only transforms --examples 2",
     "conformance check --process": "--only transforms --examples 2 --timeout 300",
     "conformance lockstep": "--steps 2 --problems vector",
@@ -123,6 +124,8 @@ def make_env(level=1, goals=()):
 """
     )
     (folder / "expected.toml").write_text("")
+    sweeps = (ROOT / "docs" / "sweeps.md").read_text(encoding="utf-8")
+    (folder / "control.toml").write_text(sweeps.partition("```toml\n")[2].partition("```")[0])
     (folder / "bin").mkdir()
     serve = f'#!/bin/sh\nexec "{sys.executable}" -m conformance.serve my_adapter.py\n'
     for path in (folder / "bin" / "COMMAND", folder / "my_dreamer"):

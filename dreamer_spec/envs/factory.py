@@ -1,8 +1,7 @@
 """Tasks by name.
 
 gym:ID                   any registered Gymnasium id: gym:CartPole-v1, gym:ALE/Pong-v5; of a module: gym:module:ID
-dmc:DOMAIN-TASK          DeepMind Control Suite from vectors: dmc:walker-walk
-dmc_vision:DOMAIN-TASK   the same from images only
+SUITE:NAME               a task of a suite with a protocol: atari:pong, dmc:walker-walk; `train tasks` lists them
 MODULE:CALLABLE          your own, a function or class that returns a gymnasium.Env: my_package.my_module:make_env
 
 A script may give the callable itself; its task is then its name.
@@ -23,13 +22,15 @@ from gymnasium.envs.registration import EnvSpec
 
 from conformance.own_names import ours, ours_in
 from dreamer_spec import arguments as keywords
+from dreamer_spec.envs import suites
 from dreamer_spec.envs.adapter import ContractEnv
 from dreamer_spec.envs.info import names_of
 from dreamer_spec.envs.sending import known_here, register, require_sendable
 from dreamer_spec.errors import UserError
 from dreamer_spec.options import Options, names_code
+from dreamer_spec.suites import SUITES
 
-SUITES = "gym:ID, dmc:DOMAIN-TASK, dmc_vision:DOMAIN-TASK or MODULE:CALLABLE"
+EXPECTED = "gym:ID, MODULE:CALLABLE or a SUITE:NAME that `train tasks` lists"
 
 # Namespace of a Gymnasium id -> the package that registers it, and our extra that installs it. Folder inside Gymnasium
 # -> our extra.
@@ -106,13 +107,16 @@ def make_env(
         return ContractEnv(env, task, index, image_size, action_repeat, info_metrics, observations, leave_out)
     suite, separator, name = task.partition(":")
     if not separator or not suite or not name:
-        raise UserError(f"unknown task {task!r}; expected {SUITES}")
+        raise UserError(f"unknown task {task!r}; expected {EXPECTED}")
     if suite == "gym":
         env = _make_gymnasium(task, name, render, arguments, time_limit)
-    elif suite in ("dmc", "dmc_vision"):
-        if arguments:
-            raise UserError(f"task {task} takes no keyword arguments, and --env-arg {next(iter(arguments))} was given")
-        env = _limited(_make_dm_control(task, name, suite == "dmc_vision", image_size, render, time_limit), time_limit)
+    elif suite in SUITES:
+        traits = SUITES[suite]
+        own_repeat, own_limit = action_repeat if traits.repeats else 1, time_limit if traits.limits else None
+        with _naming(task, arguments):
+            env = suites.make(suites.Play(suite, name, image_size, own_repeat, own_limit, render), arguments)
+        env = env if traits.limits else _limited(env, time_limit)
+        action_repeat = 1 if traits.repeats else action_repeat
     else:
         env = _limited(_call(task, _find_own(task, suite, name), render, arguments), time_limit)
     return ContractEnv(env, task, index, image_size, action_repeat, info_metrics, observations, leave_out)
@@ -201,20 +205,6 @@ def _gymnasium_extra(name: str) -> str:
     return next((_pip(extra) for folder, extra in _EXTRAS.items() if f"gymnasium.envs.{folder}" in entry_point), "")
 
 
-def _make_dm_control(
-    task: str, name: str, vision: bool, image_size: int, render: bool, time_limit: int | None
-) -> gymnasium.Env[Any, Any]:
-    domain, _, control_task = name.partition("-")
-    try:
-        adapter = importlib.import_module("dreamer_spec.envs.dm_control")
-        env: gymnasium.Env[Any, Any] = adapter.make(
-            task, domain, control_task, image_size if vision else None, renders=render, limited=not time_limit
-        )
-    except ModuleNotFoundError as error:
-        raise UserError(f"task {task} needs the package {error.name}: {_pip('dm-control')}") from error
-    return env
-
-
 def _find_own(task: str, module_name: str, name: str) -> Callable[..., Any]:
     function = getattr(_import_own(task, module_name), name, None)
     if not callable(function):
@@ -255,7 +245,7 @@ def _import_own(task: str, module_name: str) -> Any:
         if error.name is None or not f"{module_name}.".startswith(f"{error.name}."):
             raise  # The module is there; something that it imports is not.
         raise UserError(
-            f"unknown task {task!r}: no suite and no module named {module_name!r}; expected {SUITES}"
+            f"unknown task {task!r}: no suite and no module named {module_name!r}; expected {EXPECTED}"
         ) from error
 
 

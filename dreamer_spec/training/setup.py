@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from dreamer_spec import suites
 from dreamer_spec.backend import Learner, learner_class
 from dreamer_spec.disk import checkpoint, logdir
 from dreamer_spec.disk.about import About, write_about
@@ -133,6 +134,9 @@ def _say_start(run: TrainingRun, about: About) -> None:
         f"{about['parameters']:,} parameters, {counted(run.envs.count, 'environment')}, seed "
         f"{options.seed}; logs in {options.logdir}"
     )
+    values = {**vars(options), **vars(options.config), **options.env_arg}
+    if protocol := suites.in_words(options.task, values):
+        say(protocol)
     if changed := about["starts"][-1].get("changed"):
         say(
             f"changed from here on: {'; '.join(f'{name} {before} -> {now}' for name, (before, now) in changed.items())}"

@@ -15,23 +15,23 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces as gym
 
+from dreamer_spec.envs.suites import Play
 from dreamer_spec.errors import UserError
 
 CAMERAS = {"quadruped": 2}  # D-109; camera 0 elsewhere
 GLFW = ("glfw", "on", "enable", "enabled", "true", "1")  # its names as values of MUJOCO_GL
 
 
-def make(
-    task: str, domain: str, name: str, image_size: int | None, renders: bool, limited: bool = True
-) -> gymnasium.Env[Any, Any]:
-    """The task `name` of `domain`; from vectors, or where image_size is given from images only. renders: whether it can
-    be rendered; from images always. limited: whether the suite's time limit holds.
+def make(play: Play) -> gymnasium.Env[Any, Any]:
+    """A task DOMAIN-TASK, from vectors or, as `dmc_vision`, from images only.
 
     Raises:
       UserError: no such task, or this machine cannot render.
     """
-    renders = renders or image_size is not None
-    suite = _import_suite(task, renders)
+    vision = play.suite == "dmc_vision"
+    renders = play.render or vision
+    suite = _import_suite(play.task, renders)
+    domain, _, name = play.name.partition("-")
     domain = {"cup": "ball_in_cup"}.get(domain, domain)
     if (domain, name) not in suite.ALL_TASKS:
         known = ", ".join(sorted("-".join(entry) for entry in suite.ALL_TASKS if domain in ("", entry[0])))
@@ -40,28 +40,31 @@ def make(
             if known
             else f"known domains: {', '.join(sorted({entry[0] for entry in suite.ALL_TASKS}))}"
         )
-        raise UserError(f"unknown task {task!r}; {remedy}")
-    env = suite.load(domain, name, task_kwargs=None if limited else {"time_limit": math.inf})
+        raise UserError(f"unknown task {play.task!r}; {remedy}")
+    env = suite.load(domain, name, task_kwargs={"time_limit": math.inf} if play.time_limit else None)
     if renders:
-        _require_rendering(task, env.physics)
+        _require_rendering(play.task, env.physics)
     else:
         _never_render(env.physics)
-    return DmControlEnv(env, image_size, CAMERAS.get(domain, 0), "rgb_array" if renders else None)
+    return DmControlEnv(env, play, CAMERAS.get(domain, 0), "rgb_array" if renders else None)
 
 
 class DmControlEnv(gymnasium.Env[Any, np.ndarray]):
-    """A task of the suite. A time limit truncates: the suite keeps the discount at 1 there."""
+    """A task of the suite. A time limit truncates: the suite keeps the discount at 1 there. What is repeated is not
+    rendered: [LOOP-27]."""
 
-    def __init__(self, env: Any, image_size: int | None, camera: int, render_mode: str | None) -> None:
+    def __init__(self, env: Any, play: Play, camera: int, render_mode: str | None) -> None:
         self._env = env
         self.render_mode = render_mode
-        self.metadata = {"render_modes": ["rgb_array"], "render_fps": 1 / env.control_timestep()}
-        self._image_size = image_size
-        self._camera = camera
-        if image_size is None:
-            self.observation_space = gym.Dict({key: _unbounded(spec) for key, spec in env.observation_spec().items()})
+        self.metadata = {"render_modes": ["rgb_array"], "render_fps": 1 / env.control_timestep() / play.action_repeat}
+        self._play, self._camera, self._frames = play, camera, 0
+        self._sees = play.suite == "dmc_vision"
+        if self._sees:
+            self.observation_space = gym.Dict(
+                {"image": gym.Box(0, 255, (play.image_size, play.image_size, 3), np.uint8)}
+            )
         else:
-            self.observation_space = gym.Dict({"image": gym.Box(0, 255, (image_size, image_size, 3), np.uint8)})
+            self.observation_space = gym.Dict({key: _unbounded(spec) for key, spec in env.observation_spec().items()})
         action = env.action_spec()
         low, high = (
             np.broadcast_to(bound, action.shape).astype(np.float64) for bound in (action.minimum, action.maximum)
@@ -71,17 +74,26 @@ class DmControlEnv(gymnasium.Env[Any, np.ndarray]):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         if seed is not None:
             self._env.task.random.seed(seed)
+        self._frames = 0
         return self._observation(self._env.reset()), {}
 
     def step(self, action: np.ndarray) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        step = self._env.step(action)
-        terminated = step.last() and step.discount == 0
-        return self._observation(step), step.reward, terminated, step.last() and not terminated, {}
+        total = 0.0
+        for _ in range(self._play.action_repeat):
+            step = self._env.step(action)
+            self._frames += 1
+            total += step.reward
+            terminated, truncated = step.last() and step.discount == 0, step.last() and step.discount != 0
+            truncated = not terminated and (truncated or self._frames == self._play.time_limit)
+            if terminated or truncated:
+                break
+        return self._observation(step), total, terminated, truncated, {}
 
     def _observation(self, step: dm_env.TimeStep) -> dict[str, np.ndarray]:
-        if self._image_size is None:
+        if not self._sees:
             return step.observation
-        return {"image": self._env.physics.render(self._image_size, self._image_size, camera_id=self._camera)}
+        size = self._play.image_size
+        return {"image": self._env.physics.render(size, size, camera_id=self._camera)}
 
     def render(self) -> np.ndarray:
         return self._env.physics.render(240, 320, camera_id=self._camera)
@@ -113,7 +125,7 @@ def _import_suite(task: str, renders: bool) -> Any:
     try:
         return importlib.import_module("dm_control.suite")
     except ModuleNotFoundError:
-        raise  # A package, which `dreamer_spec.envs.factory` says how to install.
+        raise  # A package, which `dreamer_spec.envs.suites` says how to install.
     except (
         ImportError,
         AttributeError,

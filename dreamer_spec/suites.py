@@ -1,0 +1,112 @@
+"""The suites of tasks that have a protocol: what a task of each is played with, and what must be installed.
+
+The protocols are data, spec/benchmarks.toml. A suite that `--task` names gives a run its budget, model size, replay
+ratio, instances and action repeat, and its environment its keyword arguments; a preset and options win over them.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+from spec import benchmarks, hyperparameters, sizes
+
+RUN = ("steps", "action_repeat", "image_size", "time_limit", "size")
+"""What a protocol says of a run, beside hyperparameters (of which it has `envs` and `replay_ratio`)."""
+
+EVALUATIONS = 10  # within a budget; the paper's scores are those of training episodes
+
+
+@dataclasses.dataclass(frozen=True)
+class Suite:
+    """module: in dreamer_spec.envs.suites, whose `make` makes a task. needs: the packages to import. extra: of ours,
+    which installs them; "" where pip cannot. repeats, limits: whether `make` gets the action repeat, or the time limit,
+    and sees to it by itself."""
+
+    module: str
+    needs: tuple[str, ...]
+    extra: str
+    repeats: bool = False
+    limits: bool = False
+
+
+SUITES: Mapping[str, Suite] = {
+    "atari": Suite("atari", ("ale_py",), "atari", repeats=True, limits=True),
+    "atari100k": Suite("atari", ("ale_py",), "atari", repeats=True, limits=True),
+    "procgen": Suite("procgen", ("procgen", "gym3"), "procgen"),
+    "dmlab": Suite("dmlab", ("deepmind_lab",), "", repeats=True),
+    "dmc": Suite("dm_control", ("dm_control",), "dm-control", repeats=True, limits=True),
+    "dmc_vision": Suite("dm_control", ("dm_control",), "dm-control", repeats=True, limits=True),
+    "bsuite": Suite("bsuite", ("bsuite",), "bsuite"),
+    "crafter": Suite("crafter", ("crafter",), "crafter", limits=True),
+    "minecraft": Suite("minecraft", ("minerl",), ""),
+    "minigrid": Suite("minigrid", ("minigrid",), "minigrid"),
+}
+
+
+def suite_of(task: str) -> str | None:
+    """The suite that a task names; None for `gym:` and for modules."""
+    name, separator, rest = task.partition(":")
+    return name if name in SUITES and separator and rest else None
+
+
+def protocol(suite: str, profile: str) -> dict[str, Any]:
+    """What benchmarks.toml says of a suite, as the profile has it; {} for one that the paper does not have."""
+    entry = benchmarks().get(suite, {})
+    changed = entry.get(profile, {})
+    merged = {**entry, **changed, "env": {**entry.get("env", {}), **changed.get("env", {})}}
+    return {name: value for name, value in merged.items() if name != "official"}
+
+
+def settings(task: str, profile: str) -> dict[str, Any]:
+    """What its suite gives a run of a task: names of fields of Options, "size" and "hyperparameters"; {} without a
+    suite."""
+    suite = suite_of(task)
+    found = protocol(suite, profile) if suite else {}
+    if not found:
+        return {}
+    run = {name: found[name] for name in RUN if name in found}
+    if "steps" in found:
+        run |= {"eval_every": found["steps"] // EVALUATIONS, "random_episodes": 1}
+    chosen = {name: found[name] for name in hyperparameters() if name in found}
+    return {**run, "env_arg": found["env"], "hyperparameters": chosen}
+
+
+def in_words(task: str, values: Mapping[str, Any]) -> str | None:
+    """A line that says how a run plays a task of a suite, and what the paper has instead; None without a protocol.
+
+    values: of the run, by the names of `settings`; keyword arguments of the environment and hyperparameters among them.
+    """
+    paper = settings(task, "paper")
+    if not paper:
+        return None
+    rows = {name: paper[name] for name in RUN if name in paper} | paper["hyperparameters"] | paper["env_arg"]
+    values = {**values, "size": _size(values)}
+    words = (
+        f"{name} {show(values.get(name))}" + ("" if values.get(name) == value else f" (paper: {show(value)})")
+        for name, value in rows.items()
+    )
+    return f"protocol of {suite_of(task)}: {', '.join(words)}"
+
+
+def _size(values: Mapping[str, Any]) -> str:
+    """The model size that has these hyperparameters."""
+    found = (size for size, entry in sizes().items() if all(values.get(name) == entry[name] for name in entry))
+    return next(found, "of its own")
+
+
+def show(value: Any) -> str:
+    """A value of a protocol in words."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f"{value:,}" if isinstance(value, int) else f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def tasks_of(suite: str) -> list[str]:
+    """The tasks of a suite's protocol; [] for a suite that lists its own."""
+    return list(benchmarks().get(suite, {}).get("tasks", []))
+
+
+def install(suite: str) -> str:
+    """How to get what a suite needs: a command, or the page that says it."""
+    extra = SUITES[suite].extra
+    return f"pip install 'dreamer-spec[{extra}]'" if extra else "see docs/suites.md"
