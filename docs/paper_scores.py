@@ -44,7 +44,7 @@ SUITES: dict[str, tuple[str, Callable[[str], str]]] = {
     "procgen": ("tab:procgen", slug),
     "dmlab": ("tab:dmlab", slug),
     "atari100k": ("tab:atari100k", slug),
-    "dmc_proprio": ("tab:dmc_proprio", control_task),
+    "dmc": ("tab:dmc_proprio", control_task),
     "dmc_vision": ("tab:dmc_vision", control_task),
     "bsuite": ("tab:bsuite", slug),
 }

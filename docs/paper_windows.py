@@ -58,7 +58,7 @@ def read_curves(path: Path, suite: str) -> list[Run]:
 
 def end_of(runs: Sequence[Run], budget: float) -> float:
     """Where the window ends: at the budget; or at the last point of the curves, if all of a file lack the last bin, as
-    those of Dreamer in dmc_proprio do, which end at 490,000 of 500,000 steps."""
+    those of Dreamer in dmc do, which end at 490,000 of 500,000 steps."""
     last = max(float(run.steps[-1]) for run in runs)
     return last if last < WHOLE * budget else budget
 

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from decimal import Decimal
 from importlib import resources
 
-SUITES = ("minecraft", "atari", "procgen", "dmlab", "atari100k", "dmc_proprio", "dmc_vision", "bsuite")
+SUITES = ("minecraft", "atari", "procgen", "dmlab", "atari100k", "dmc", "dmc_vision", "bsuite")
 
 Row = Mapping[str, Decimal | None]  # column -> number; None for a missing entry
 

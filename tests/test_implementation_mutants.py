@@ -1,14 +1,16 @@
 """The mistakes that are planted in the backends, the learners and the trainer: each fits its file, and is noticed."""
 
 import collections
+import contextlib
 import shlex
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from conformance import cli
 from conformance.errors import UserError
-from conformance.mutants.implementations import KINDS, Patch, catalogues, patches
+from conformance.mutants.implementations import KINDS, Patch, catalogues, patches, trial
 from conformance.mutants.implementations.judging import REACHED_FROM, reaching, require_copy
 from conformance.mutants.implementations.planting import planted
 from conformance.mutants.implementations.report import chosen, column_of, counts, is_bad, to_json
@@ -126,6 +128,35 @@ def test_outcomes_are_counted_by_kind() -> None:
     assert [is_bad(entry) for entry in report.values()] == [False, True, False, False]
     assert column_of(to_json(equivalent, Outcome())) == "equivalent"
     assert is_bad(to_json(equivalent, caught)), "what is argued to be equivalent must not be noticed"
+
+
+def test_a_process_that_ends_without_the_mistake_too_notices_nothing(
+    compiled: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever ends it: its answer counts only where the right implementation gives one."""
+    patch = next(patch for patch in PATCHES.values() if patch.candidate == "torch" and not patch.tests)
+    ended = Outcome("check", "(the process got signal 6)", "float32", "signal")
+
+    right_too = False
+    planted_at: list[Path] = []
+
+    def answer(asked: Patch, request: dict[str, object], root: Path, compiled: Path) -> Outcome:
+        return ended if right_too or root == planted_at[0] else Outcome()
+
+    original = trial.planted
+
+    @contextlib.contextmanager
+    def noted(asked: Patch | None) -> Iterator[Path]:
+        with original(asked) as root:
+            if asked:
+                planted_at[:] = [root]
+            yield root
+
+    monkeypatch.setattr(trial, "_answer", answer)
+    monkeypatch.setattr(trial, "planted", noted)
+    assert Trials().judge(patch, compiled).by == "check"
+    right_too = True
+    assert Trials().judge(patch, compiled).by is None
 
 
 @pytest.mark.parametrize("name", SAMPLE)

@@ -65,7 +65,7 @@ def test_normalization_and_caps() -> None:
     pong = arrays([-20.7, 14.6, 32.25])  # random, gamer, 1.5 times as far
     assert mean.normalized(["pong"], pong)[0] == pytest.approx([0, 100, 150])
     assert capped.normalized(["pong"], arrays([-62.4, 21, 40]))[0] == pytest.approx([-100, 100, 100]), "above only"
-    task_mean = SUMMARIES["dmc_proprio"][0]
+    task_mean = SUMMARIES["dmc"][0]
     assert task_mean.normalized(["walker-walk"], arrays([936]))[0] == 936
     assert (mean.unit, task_mean.unit) == ("%", "")
 
@@ -126,7 +126,7 @@ def test_intervals_hold_the_truth_about_as_often_as_they_say() -> None:
 
 
 def test_tasks_are_found_by_their_names() -> None:
-    assert split_task("dmc:walker-walk") == ("dmc_proprio", "walker-walk")
+    assert split_task("dmc:walker-walk") == ("dmc", "walker-walk")
     assert split_task("dmc_vision:walker-walk") == ("dmc_vision", "walker-walk")
     assert split_task("atari:pong") == ("atari", "pong")
     assert split_task("dmlab:rooms_collect_good_objects_train") == ("dmlab", "rooms_collect_good_objects_test")
@@ -229,7 +229,7 @@ def test_scores_beside_those_of_the_paper(
     monkeypatch.setenv("COLUMNS", "160")
     assert main(["score", str(study(tmp_path / "runs"))]) == 0
     lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
-    assert "dmc_proprio: 2 of 18 tasks" in lines
+    assert "dmc: 2 of 18 tasks" in lines
     assert "walker-walk 2 2 950 70.71 64 952 942 969 936" in lines
     assert "hopper-hop 2 2 150 70.71 0 36 68 80 113" in lines
     # The mean over the two tasks of the paper's columns, not the printed one over 18.
@@ -246,7 +246,7 @@ def test_every_score_carries_its_statement(tmp_path: Path, capsys: pytest.Captur
     for text in (text.replace("\\", "") for text in texts):
         for said in (
             "mean return of the training episodes that ended in the window",
-            "dmc_proprio: the last 4 % of 500,000 environment steps",
+            "dmc: the last 4 % of 500,000 environment steps",
             "other tasks: the last 5 % of 500,000 environment steps",
             "5 training episodes; 1 to 1 a run",
             "0, 1 (dmc:walker-walk, dmc:hopper-hop)",
@@ -259,7 +259,7 @@ def test_every_score_carries_its_statement(tmp_path: Path, capsys: pytest.Captur
         ):
             assert said in text
     data = json.loads(texts[-1])
-    assert [entry["suite"] for entry in data["suites"]] == ["dmc_proprio", ""]
+    assert [entry["suite"] for entry in data["suites"]] == ["dmc", ""]
     assert data["suites"][0]["summaries"][0]["paper_is"] == "from its rows for the same tasks"
     assert data["runs"][0]["command"].endswith("--seed 0 --logdir somewhere")
     rows = list(csv.DictReader(line for line in texts[2].splitlines() if not line.startswith("#")))

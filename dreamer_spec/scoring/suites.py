@@ -16,7 +16,7 @@ NAMESPACES = {
     "procgen": "procgen",
     "dmlab": "dmlab",
     "atari100k": "atari100k",
-    "dmc": "dmc_proprio",
+    "dmc": "dmc",
     "dmc_vision": "dmc_vision",
 }
 OTHER_WINDOW = 0.05  # the share of the budget, for tasks that the paper does not have
@@ -67,13 +67,13 @@ SUMMARIES: Mapping[str, tuple[Summary, ...]] = {
     "procgen": _three("normalized_{}", "range"),
     "dmlab": _three("human_{}_capped", "human", capped=True),
     "atari100k": _three("gamer_{}", "gamer"),
-    "dmc_proprio": _three("task_{}", ""),
+    "dmc": _three("task_{}", ""),
     "dmc_vision": _three("task_{}", ""),
 }
 
 
 def split_task(task: str) -> tuple[str, str]:
-    """dmc:walker-walk -> "dmc_proprio", "walker-walk". A task of no suite of the paper, or that its table lacks, is of
+    """dmc:walker-walk -> "dmc", "walker-walk". A task of no suite of the paper, or that its table lacks, is of
     the suite "", under its whole name."""
     namespace, _, name = task.partition(":")
     suite = NAMESPACES.get(namespace, "")

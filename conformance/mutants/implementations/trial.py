@@ -21,6 +21,7 @@ JUDGING = "conformance.mutants.implementations.judging"
 DTYPES = ("float32", "float64", "bfloat16")
 TIMEOUT = 1800.0  # seconds of one process: a mutant may hang
 EXAMPLES = 5
+PROCESS = ("timeout", "signal")  # how a process ends that does not answer
 CRASHES = (signal.SIGSEGV, signal.SIGABRT)  # of the mutant's own making; somebody may have ended the process otherwise
 
 
@@ -72,6 +73,9 @@ class Trials:
             found = judged(patch, root, compiled, skip=skip, preflight=preflight, examples=self._examples)
             if not found.is_caught or self._sound(patch, found, compiled):
                 break
+            if found.how in PROCESS:  # not of the mistake's making: nothing more can be learned from checks
+                found = Outcome()
+                break
             if found.by == "check":
                 skip.append((str(found.dtype), str(found.name)))
             else:
@@ -87,7 +91,7 @@ class Trials:
 
     def _sound(self, patch: Patch, found: Outcome, compiled: Path) -> bool:
         """Whether the implementation without the mistake passes what noticed it."""
-        if not self._confirm or found.how in ("timeout", "signal"):
+        if not self._confirm:
             return True
         key = (patch.candidate, found.by, found.dtype, found.name if found.by != "preflight" else None)
         if key not in self._passes:
@@ -95,9 +99,12 @@ class Trials:
                 if found.by == "test":
                     again = tested_with(str(found.name), root, compiled)
                 else:
-                    only = [found.dtype, found.name] if found.by == "check" else ["", ""]
+                    one = [found.dtype, found.name] if found.by == "check" else ["", ""]
+                    only = None if found.how in PROCESS else one
+                    dtypes = [str(found.dtype)] if found.by == "check" else []
+                    preflight = found.by == "preflight"
                     again = judged(
-                        patch, root, compiled, only=only, preflight=found.by == "preflight", examples=self._examples
+                        patch, root, compiled, only=only, dtypes=dtypes, preflight=preflight, examples=self._examples
                     )
             self._passes[key] = not again.is_caught
         return self._passes[key]
@@ -110,31 +117,45 @@ def judged(
     *,
     skip: list[tuple[str, str]] | None = None,
     only: list[Any] | None = None,
+    dtypes: list[str] | None = None,
     preflight: bool,
     examples: int,
 ) -> Outcome:
-    """What the checks and the preflight find in the copy at `root`.
+    """What the checks, and after them the preflight, find in the copy at `root`. dtypes: of the checks; those that the
+    candidate has, the likeliest first, by default.
+
+    Each precision has a process of its own: what JAX compiles for all of them is more than one can hold.
 
     Raises:
       RuntimeError: judging itself does not work.
     """
     likeliest = "bfloat16" if patch.kind == "precision" else "float32"
-    dtypes = ["float64"] if patch.candidate == "trainer" else sorted(DTYPES, key=lambda dtype: dtype != likeliest)
+    if dtypes is None:
+        dtypes = ["float64"] if patch.candidate == "trainer" else sorted(DTYPES, key=lambda dtype: dtype != likeliest)
     request = {
         "candidate": patch.candidate,
         "file": patch.file,
-        "dtypes": dtypes,
         "device": patch.device,
         "examples": examples,
         "skip": skip or [],
         "only": only,
-        "preflight": preflight,
     }
+    found = Outcome()
+    for dtype in dtypes:
+        found = _answer(patch, {**request, "dtypes": [dtype], "preflight": False}, root, compiled)
+        if found.by is not None:
+            return found
+    return _answer(patch, {**request, "dtypes": [], "preflight": True}, root, compiled) if preflight else found
+
+
+def _answer(patch: Patch, request: Mapping[str, Any], root: Path, compiled: Path) -> Outcome:
+    """What one process finds."""
     ran = _run([sys.executable, "-m", JUDGING, json.dumps(request)], root, compiled)
+    by, dtype = ("check", request["dtypes"][0]) if request["dtypes"] else ("preflight", None)
     if ran is None:
-        return Outcome("check", "(the process did not end)", None, "timeout")
+        return Outcome(by, "(the process did not end)", dtype, "timeout")
     if -ran.returncode in CRASHES:
-        return Outcome("check", f"(the process got signal {-ran.returncode})", None, "signal")
+        return Outcome(by, f"(the process got signal {-ran.returncode})", dtype, "signal")
     if ran.returncode:
         raise RuntimeError(f"judging {patch.name} ended with {ran.returncode}:\n{ran.stderr[-2000:]}")
     answer: Mapping[str, Any] = json.loads(ran.stdout.strip().splitlines()[-1])
