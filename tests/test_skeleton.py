@@ -7,10 +7,11 @@ from typing import Any
 
 import pytest
 
-from conformance.adapter import CONFIG_FIELDS, INTERFACE, load_adapter
 from conformance.case import Setting
 from conformance.cli import main
 from conformance.execute import run_check, selected_checks
+from conformance.interface import CONFIG_FIELDS, INTERFACE
+from conformance.our_candidates import load_adapter
 from conformance.problems import small_config
 from conformance.skeleton import FIRST, HOOKS, functions_by_chapter, skeleton
 from spec import Config

@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from conformance.adapter import load_adapter
 from conformance.candidate import load_candidate
 from conformance.case import Setting
 from conformance.check import Check
 from conformance.errors import UserError
 from conformance.execute import missing, run_check, selected_checks
 from conformance.offered import offered
+from conformance.our_candidates import load_adapter
 from dreamer_spec import translation
 from dreamer_spec.envs import vector
 from dreamer_spec.training import loop, setup
