@@ -8,11 +8,12 @@ samples instead. Functions named `draw_...` sample with a generator of their own
 adapter is in docs/adapters.md.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
 
+from conformance.running.interface import RunEnvironment, RunLearner, RunOptions
 from spec import Config, Parameter, Spaces
 
 Array = np.ndarray
@@ -388,6 +389,28 @@ class Adapter(Protocol):
     ) -> Arrays: ...
     def environment_action(self, action: Array, spaces: Spaces, low: Arrays, high: Arrays) -> Arrays: ...
     def derive_seed(self, seed: int, purpose: str, index: int) -> int: ...
+    def run(
+        self,
+        environment: Callable[[], RunEnvironment],
+        learner: Callable[[Spaces, Config, int], RunLearner],
+        options: RunOptions,
+    ) -> Nested | None:
+        """A whole training run, in this process and with the environments and the learner that are given.
+
+        Args:
+          environment: makes one, with reset(seed=...) and step(action) as Gymnasium has them. Its bounds of actions are
+            its attributes low and high: key -> [size].
+          learner: called with spaces, config and seed, makes the learner that acts and is trained: initial_carry(envs),
+            policy(observation, is_first, carry, seed), train_step(batch, seed), state_dict(), load_state_dict(state),
+            save_carry(carry), load_carry(arrays).
+          options: what the run shall be: spaces, config, seed, steps, directory, action_repeat, evaluate_every,
+            evaluation_episodes, shared_environment, nonfinite, begin_with. Raise NotImplementedError for what the loop
+            does not have. `conformance.running.interface` says what each of these three means.
+
+        Returns:
+          None, or "episodes": score and length of each episode of training, in the order of their ends; "evaluations":
+          the mean score of each evaluation. A continued run says those since it was continued.
+        """
 
 
 class Learner(Protocol):
