@@ -203,8 +203,8 @@ ANEW = ("LOOP-21", "LOOP-23", "LOOP-26", "REP-25")
 
 @script(*ANEW, uses=["run"], level=0)
 def environments_that_lead_elsewhere_begin_anew(script: Script) -> None:
-    """Where the same actions lead elsewhere, a continued run begins with resets, fresh carries and new streams, and goes
-    on with its training state and its counters."""
+    """Where the same actions lead elsewhere, a continued run begins with resets, fresh carries and new streams, and
+    goes on with its training state and its counters."""
     with runs_of(script) as runs:
         config = config_of(script, replay_ratio=5.0)
         parts = [runs.play("run", config, World(repeatable=False), steps=steps) for steps in (42, 81, 120)]
@@ -261,8 +261,8 @@ def is_played(frame: Frame, diary: Diary, acted: set[Any]) -> bool:
 
 @script("LOOP-72", uses=["run"], level=0)
 def a_warm_start_takes_over_what_was_learned(script: Script) -> None:
-    """Parameters, slow critic and return range of the other run, bit for bit; the optimizer, the buffer and all counters
-    begin anew."""
+    """Parameters, slow critic and return range of the other run, bit for bit; the optimizer, the buffer and all
+    counters begin anew."""
     with runs_of(script) as runs:
         config = config_of(script)
         other = runs.play("other", config)
@@ -298,10 +298,8 @@ def a_failed_environment_is_replaced(script: Script) -> None:
     for record, right in zip(records, expected, strict=True):
         if record.row != broken:
             script.exact(f"policy step {record.act}, row {record.row}", record.frame.key, right.frame.key)
-    missing = next(
-        record for record in records if record.frame.environment > failing.failed[0] and record.row == broken
-    )
-    script.holds("the record of the new environment begins an episode", missing.is_first)
+    new = next(one for one in records if one.row == broken and one.frame.environment > failing.failed[0])
+    script.holds("the first record of the new environment begins an episode", new.is_first)
     compare_train_steps(script, learned, trained, "with an environment that fails", STEPS)
     compare_batches(script, learned, trained)
 

@@ -89,7 +89,7 @@ class DiaryLearner:
     def _update(self, number: int) -> None:
         """Changes every array, none of them like another."""
         change = np.float32((number % 1000 + 1) / 1024)
-        floats = [name for name in self._state if name != "optimizer/step"]
+        floats = sorted(name for name in self._state if name != "optimizer/step")
         new = {name: np.float32(0.5) * self._state[name] + change / (1 + place) for place, name in enumerate(floats)}
         self._state = {**new, "optimizer/step": self._state["optimizer/step"] + 1}
         self._mark, self._diary.last_state = mark_of(self._state), self._state
