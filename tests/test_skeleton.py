@@ -83,7 +83,7 @@ def test_the_skeleton_is_grouped_by_chapter() -> None:
     assert chapters["returns"][0] == "lambda_return"
     assert chapters["rssm"][-2:] == ["observe_given", "imagine_given"]
     assert {"gradients", "train_step_given", "draw_parameters"} < set(chapters["agent"])
-    assert chapters["training_loop"][-1] == "derive_seed"
+    assert chapters["training_loop"][-2:] == ["derive_seed", "run"]
     assert "# --- returns: spec/07-returns.md ---" in skeleton("mine.py")
 
 

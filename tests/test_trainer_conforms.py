@@ -38,10 +38,12 @@ def test_the_trainer_offers_all_of_its_two_chapters() -> None:
         "make_record",
         "environment_action",
         "derive_seed",
+        "run",
     ]
-    of_these = {check.name for check in selected_checks("float64") if check.name.startswith(("replay.", "training_l"))}
+    chapters = ("replay.", "training_loop.", "running_loop.", "going_on.")
+    of_these = {check.name for check in selected_checks("float64") if check.name.startswith(chapters)}
     assert set(CHECKS) == of_these
-    assert len(of_these) >= 27
+    assert len(of_these) >= 51
 
 
 def kept_at_the_end(record: Any, action: Any, latents: Any) -> Any:

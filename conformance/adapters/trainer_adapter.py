@@ -18,7 +18,7 @@ from dreamer_spec.envs import vector
 from dreamer_spec.options import Options
 from dreamer_spec.training import loop, setup
 from dreamer_spec.translation import Entry, Translation
-from spec import Config, Discrete, Spaces, Vector
+from spec import Config, Discrete, Image, Spaces, Vector
 
 CALLED_BY = {"ReplayRatio": setup, "can_train": loop, "derive_seed": loop, "step_flags": vector}
 """Function of the interface that the trainer calls as it is -> the module that calls it."""
@@ -176,11 +176,11 @@ class _Backend:
     def predict(
         self, observation: Any, prev_action: Any, is_first: np.ndarray, context: int, seed: int
     ) -> dict[str, np.ndarray]:
-        """For the pictures of an evaluation: nothing is foreseen."""
-        sizes = {key: (space.encoded_size,) for key, space in self._spaces.observations.items()}
-        return {
-            key: np.zeros((*is_first.shape, *size)) for key, size in {**sizes, "reward": (), "continue_": ()}.items()
-        }
+        """For the pictures of an evaluation: nothing is foreseen. The kit's environments have no images."""
+        spaces = self._spaces.observations.items()
+        sizes = {key: (space.encoded_size,) for key, space in spaces if not isinstance(space, Image)}
+        scalars: dict[str, tuple[int, ...]] = {"reward": (), "continue_": ()}
+        return {key: np.zeros((*is_first.shape, *size)) for key, size in {**sizes, **scalars}.items()}
 
 
 def make_adapter(dtype: str, device: str | None) -> TrainerAdapter:

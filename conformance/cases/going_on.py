@@ -19,7 +19,7 @@ from conformance.cases.running_loop import (
     learning,
 )
 from conformance.check import script
-from conformance.running.diary import Act, Diary, Frame, Train
+from conformance.running.diary import Act, Diary, Frame
 from conformance.running.environment import World
 from conformance.running.playing import STEPS, Runs, config_of, runs_of
 from conformance.running.records import records_of
@@ -27,30 +27,26 @@ from conformance.script import Script
 from spec import Config
 
 EPISODES = 4  # of an evaluation: more than the workers, and no multiple of them
-EVALUATED: dict[str, Any] = {"evaluate_every": 18, "evaluation_episodes": EPISODES}
-SHORT = World(longest=4)
+EVALUATED: dict[str, Any] = {"evaluate_every": 25, "evaluation_episodes": EPISODES}
+SHARED: dict[str, Any] = {"shared_environment": True, "evaluation_episodes": 2}
+SHORT = World(longest=2)
 
 
 def evaluated(script: Script, runs: Runs, config: Config, **options: Any) -> tuple[Diary, Diary, list[list[Act]]]:
     """A run without evaluations, one with them, and the policy steps of each evaluation."""
     plain = runs.play("plain", config, SHORT)
-    diary = runs.play("evaluated", config, SHORT, **EVALUATED, **options)
+    diary = runs.play("evaluated", config, SHORT, **{**EVALUATED, **options})
     training = {key for act in plain.acts for key in act.keys}
     evaluations: list[list[Act]] = []
-    before: Act | Train | None = None
+    begins = True
     for event in learning(diary):
-        if is_evaluation(event, training):
-            if before is None or not is_evaluation(before, training):
-                evaluations.append([])
+        is_evaluation = isinstance(event, Act) and training.isdisjoint(event.keys)
+        if isinstance(event, Act) and is_evaluation:
+            evaluations += [[]] if begins else []
             evaluations[-1].append(event)
-        before = event
+        begins = not is_evaluation
     script.holds("there were two evaluations or more", len(evaluations) > 1)
     return plain, diary, evaluations
-
-
-def is_evaluation(event: Act | Train, training: set[Any]) -> bool:
-    """Whether it is a policy step of observations that are not among those of training."""
-    return isinstance(event, Act) and training.isdisjoint(event.keys)
 
 
 def without(diary: Diary, evaluations: list[list[Act]]) -> Diary:
@@ -79,21 +75,13 @@ def a_shared_environment_changes_nothing(script: Script) -> None:
     """With one environment for training and evaluation, training gets the episodes that it gets with two, and an
     evaluation begins where one of these has ended."""
     with runs_of(script) as runs:
-        plain, diary, evaluations = evaluated(script, runs, config_of(script, envs=1), shared_environment=True)
+        plain, diary, evaluations = evaluated(script, runs, config_of(script, envs=1), **SHARED)
     script.exact("environments that were reset", diary.environments, 1)
     compare_learning(script, "training", without(diary, evaluations), plain)
-    begun = {acts[0].keys[0] for acts in evaluations}
-    frames = [frame for frame in diary.frames if frame.action is not None or frame.key in begun]
-    acted = [frame for frame in diary.frames if frame.key in {key for act in plain.acts for key in act.keys}]
-    script.holds("frames of both", len(frames) > len(acted) > 0)
+    begun = {acts[0].keys[0] for acts in evaluations[:-1]}  # the last one may abandon an episode
     for before, frame in itertools.pairwise(diary.frames):
-        if frame.key in begun and frame.key != begun_last(evaluations):
-            script.holds("an evaluation begins at an end", before.terminated or before.truncated)
-
-
-def begun_last(evaluations: list[list[Act]]) -> Any:
-    """The observation that the last evaluation begins with, which may abandon an episode."""
-    return evaluations[-1][0].keys[0]
+        if frame.key in begun:
+            script.holds("an evaluation begins where an episode has ended", before.terminated or before.truncated)
 
 
 @script("LOOP-18", "LOOP-19", "LOOP-33", uses=["run"], level=0)
@@ -231,8 +219,9 @@ def joined(parts: Sequence[Diary]) -> Diary:
     first = 0
     for part in parts:
         for event in part.events:
-            own = isinstance(event, Frame)
-            events.append(dataclasses.replace(event, environment=event.environment + first) if own else event)
+            if isinstance(event, Frame):
+                event = dataclasses.replace(event, environment=event.environment + first)
+            events.append(event)
         first += part.environments
         latents |= part.latents
     return Diary(events, first, latents=latents)
@@ -246,17 +235,8 @@ def environments_that_begin_anew_have_the_seeds_of_their_start(script: Script) -
         parts = [runs.play("run", config, World(repeatable=False), steps=steps) for steps in (30, 60, 90)]
     for start, part in enumerate(parts):
         indices = [worker + config.envs * start for worker in range(config.envs)]
-        acted = {key for act in part.acts for key in act.keys}
-        played = dataclasses.replace(part, events=[frame for frame in part.frames if is_played(frame, part, acted)])
         seeds = [derived(script, script.setting.seed, "environment", index) for index in indices]
-        compare_episode_seeds(script, played, records_of(script, part), seeds)
-
-
-def is_played(frame: Frame, diary: Diary, acted: set[Any]) -> bool:
-    """Whether it is of the run itself, and not of an attempt to repeat an earlier episode."""
-    own = [one.key in acted for one in diary.frames if one.environment == frame.environment]
-    at = [one for one in diary.frames if one.environment == frame.environment].index(frame)
-    return any(own[: at + 1])
+        compare_episode_seeds(script, records_of(script, part), seeds)
 
 
 @script("LOOP-72", uses=["run"], level=0)
@@ -312,7 +292,7 @@ def a_replaced_environment_has_the_seed_of_its_restart(script: Script) -> None:
     records = records_of(script, diary)
     row = next(record.row for record in records if record.frame.environment == diary.failed[0])
     seed = derived(script, derived(script, script.setting.seed, "environment", row), "restart", 0)
-    new = [record for record in records if record.row == row and record.frame.environment != diary.failed[0]]
-    resets = [frame.seed for frame in diary.frames if frame.is_reset and frame.environment == new[0].frame.environment]
-    expected = [derived(script, seed, "episode", number) for number in range(len(resets))]
-    script.exact("seeds of the episodes of the new environment", resets, expected)
+    new = [one for one in records if one.row == row and one.frame.environment != diary.failed[0] and one.is_first]
+    expected = [derived(script, seed, "episode", number) for number in range(len(new))]
+    script.holds("a new environment has begun an episode", new)
+    script.exact("seeds of the episodes of the new environment", [record.frame.seed for record in new], expected)

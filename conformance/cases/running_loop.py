@@ -298,22 +298,20 @@ def seeds_are_those_of_the_tables(script: Script) -> None:
     for purpose, events in (("policy", diary.acts), ("train", diary.trains)):
         expected = [derived(script, seed, purpose, number) for number in range(len(events))]
         script.exact(f"seeds of {purpose}", [event.seed for event in events], expected)
-    compare_episode_seeds(
-        script, diary, records_of(script, diary), [derived(script, seed, "environment", w) for w in range(3)]
-    )
+    seeds = [derived(script, seed, "environment", worker) for worker in range(3)]
+    compare_episode_seeds(script, records_of(script, diary), seeds)
 
 
 def derived(script: Script, seed: int, purpose: str, index: int) -> int:
     return int(script.call("derive_seed", seed, purpose, index))
 
 
-def compare_episode_seeds(script: Script, diary: Diary, records: list[Record], seeds: list[int]) -> None:
-    """The resets of the environment in each row. seeds: of the workers, in the order of the rows."""
-    environments = {record.row: record.frame.environment for record in records}
+def compare_episode_seeds(script: Script, records: list[Record], seeds: list[int]) -> None:
+    """Of the resets in each row. seeds: of the workers, in the order of the rows."""
     for row, seed in enumerate(seeds):
-        resets = [frame for frame in diary.frames if frame.is_reset and frame.environment == environments[row]]
-        expected = [derived(script, seed, "episode", number) for number in range(len(resets))]
-        script.exact(f"seeds of the episodes in row {row}", [frame.seed for frame in resets], expected)
+        played = [record.frame.seed for record in records if record.row == row and record.is_first]
+        expected = [derived(script, seed, "episode", number) for number in range(len(played))]
+        script.exact(f"seeds of the episodes in row {row}", played, expected)
 
 
 DRAWN = ("LOOP-4", "LOOP-26", "REP-4", "REP-7", "REP-8", "REP-9", "REP-12", "REP-33")
@@ -379,9 +377,10 @@ def scores_are_plain_sums(script: Script) -> None:
         diary = runs.play("run", config_of(script))
     if not diary.result or "episodes" not in diary.result:
         raise NotImplementedError("run returns no scores")
-    expected, under_way = [], {}
+    expected: list[tuple[float, int]] = []
+    under_way: dict[int, tuple[float, int]] = {}
     for record in records_of(script, diary):
-        score, length = under_way.get(record.worker, (0.0, 0)) if not record.is_first else (0.0, 0)
+        score, length = (0.0, 0) if record.is_first else under_way[record.worker]
         under_way[record.worker] = score + record.reward, length + 1
         if record.is_last:
             expected.append(under_way[record.worker])

@@ -12,8 +12,8 @@ from spec import Discrete, Spaces, Vector
 SPACES = Spaces(
     {"place": Vector(6), "clock": Discrete((4,))}, {"jump": Discrete((3,)), "steer": Vector(2), "turn": Vector(1)}
 )
-LOW = {"steer": np.float32([0, -2]), "turn": np.float32([-np.inf])}
-HIGH = {"steer": np.float32([10, 2]), "turn": np.float32([np.inf])}
+LOW = {"steer": np.array([0, -2], np.float32), "turn": np.array([-np.inf], np.float32)}
+HIGH = {"steer": np.array([10, 2], np.float32), "turn": np.array([np.inf], np.float32)}
 LONGEST = 7  # frames of an episode, the reset not counted
 DIGIT = 2**12  # of a seed; float32 holds each exactly
 
@@ -49,7 +49,7 @@ class CountingEnvironment:
         self._number = -1
         self._steps = 0
         self._over = True
-        self._observation = {"place": np.zeros(6, np.float32), "clock": np.zeros(1, np.int64)}
+        self._observation: dict[str, np.ndarray] = {"place": np.zeros(6, np.float32), "clock": np.zeros(1, np.int64)}
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Mapping[str, np.ndarray], dict[str, Any]]:
         if self._number < 0:

@@ -88,7 +88,7 @@ class _Workers:
 
     def of(self, environment: int, row: int) -> int:
         if environment not in self._worker:
-            before = self._in_row.get(row)
+            before = self._in_row.get(row, -1)
             self._worker[environment] = (
                 self._worker[before] if before in self._failed else len(set(self._worker.values()))
             )
