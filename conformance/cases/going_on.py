@@ -162,11 +162,11 @@ RESUMED = ("LOOP-21", "LOOP-23", "LOOP-34", "REP-23", "REP-29", "REP-33")
 @script(*RESUMED, uses=["run"], level=0)
 def a_continued_run_is_the_run_in_one_go(script: Script) -> None:
     """Where environments can be brought back, every policy step and every train step after it gets what it would have
-    got, and the training state at the end is the same: with several workers, with a buffer that has been full, and
-    twice in a row."""
+    got, and the training state at the end is the same: with more new sequences than batches have room for, and with a
+    buffer that has been full, twice in a row."""
     with runs_of(script) as runs:
         for name, config, parts in (
-            ("three workers", config_of(script, replay_ratio=5.0), (42, 81)),
+            ("three workers", config_of(script, replay_ratio=0.6), (60, 120)),
             ("one full buffer", config_of(script, envs=1, replay_ratio=7.0, replay_capacity=70), (90, 140, 200)),
         ):
             whole = runs.play(f"{name} in one go", config, steps=parts[-1])

@@ -85,6 +85,7 @@ def environments_get_the_action_of_their_own_row(script: Script) -> None:
 def compare_actions(script: Script, diary: Diary, records: list[Record]) -> None:
     flat = {record.frame.key: record.action for record in records}
     latest: dict[int, np.ndarray] = {}
+    script.holds("no environment is stepped after an end", not any(frame.after_end for frame in diary.frames))
     for frame in diary.frames:
         if frame.action is not None and frame.environment in latest:
             expected = environment_action(latest[frame.environment], SPACES, LOW, HIGH)
