@@ -102,7 +102,7 @@ LACKING = {  # what the loop of the document does not have
     ),
     *("evaluations_play_new_episodes_with_fresh_noise", "an_evaluation_is_the_mean_of_whole_episodes"),
     *("a_continued_run_is_the_run_in_one_go", "environments_that_lead_elsewhere_begin_anew"),
-    "a_warm_start_takes_over_what_was_learned",
+    *("a_warm_start_takes_over_what_was_learned", "scores_are_plain_sums"),
 }
 
 

@@ -109,7 +109,8 @@ def is_under_way(reset: Frame, diary: Diary) -> bool:
 
 @script("LOOP-25", "LOOP-26", "LOOP-33", uses=["run", "derive_seed"], level=0)
 def evaluations_have_the_seeds_of_the_tables(script: Script) -> None:
-    """Of every policy step of evaluation, and of every episode of each of its environments."""
+    """Every policy step of evaluation has the seed of its number, and every episode of each environment that of
+    its own."""
     with runs_of(script) as runs:
         _, diary, evaluations = evaluated(script, runs, config_of(script))
     seed = script.setting.seed
@@ -127,7 +128,7 @@ def evaluations_have_the_seeds_of_the_tables(script: Script) -> None:
 
 @script("LOOP-20", uses=["run"], level=0)
 def an_evaluation_is_the_mean_of_whole_episodes(script: Script) -> None:
-    """Of as many as were asked for, each the plain sum of its rewards."""
+    """Its score is that of as many episodes as were asked for, each the plain sum of its rewards."""
     with runs_of(script) as runs:
         _, diary, evaluations = evaluated(script, runs, config_of(script))
     if not diary.result or "evaluations" not in diary.result:
@@ -229,7 +230,7 @@ def joined(parts: Sequence[Diary]) -> Diary:
 
 @script("LOOP-26", uses=["run", "derive_seed"], level=0)
 def environments_that_begin_anew_have_the_seeds_of_their_start(script: Script) -> None:
-    """The index counts the starts of a run that was continued twice with new episodes."""
+    """The seeds of the workers count the starts of a run that was continued twice with new episodes."""
     with runs_of(script) as runs:
         config = config_of(script)
         parts = [runs.play("run", config, World(repeatable=False), steps=steps) for steps in (30, 60, 90)]
@@ -286,7 +287,7 @@ def a_failed_environment_is_replaced(script: Script) -> None:
 
 @script("LOOP-32", uses=["run", "derive_seed"], level=0)
 def a_replaced_environment_has_the_seed_of_its_restart(script: Script) -> None:
-    """Derived from that of the worker whose environment failed; the seeds of its episodes follow from it."""
+    """The worker's seed is derived from the one before, and those of the new environment's episodes follow from it."""
     with runs_of(script) as runs:
         diary = runs.play("run", config_of(script), FAILS)
     records = records_of(script, diary)

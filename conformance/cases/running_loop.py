@@ -75,8 +75,8 @@ def each_worker_goes_on_with_its_own_carry(script: Script) -> None:
 
 @script("LOOP-6", "LOOP-12", "CON-27", uses=["run"], level=0)
 def environments_get_the_action_of_their_own_row(script: Script) -> None:
-    """From the first record on the action of the policy step, clipped and in the environment's units: a range, a single
-    number without bounds, and a choice by its index."""
+    """From the first record on an environment gets what the policy step chose, clipped and in its own units: numbers in
+    a range, a number without bounds, and a choice by its index."""
     with runs_of(script) as runs:
         diary = runs.play("run", config_of(script))
     compare_actions(script, diary, records_of(script, diary))
@@ -190,8 +190,8 @@ COUNTED = ("LOOP-4", "LOOP-5", "LOOP-13", "LOOP-14", "LOOP-15", "LOOP-16")
 
 @script(*COUNTED, uses=["run"], level=0)
 def train_steps_are_counted_exactly(script: Script) -> None:
-    """Between two policy steps as many as the replay ratio says, from the first record on that makes enough sequences:
-    with several ratios and workers, none with ratio 0, and no more where actions are repeated."""
+    """Between two policy steps there are as many as the replay ratio says, from the first record on that makes enough
+    sequences: with several ratios and workers, none with ratio 0, and no more where actions are repeated."""
     runs = ((0.7, 1, 1), (7.3, 2, 1), (6.0, 3, 1), (32.0, 2, 1), (0.0, 2, 1), (6.0, 2, 3))
     with runs_of(script) as place:
         for number, (ratio, workers, repeat) in enumerate(runs):
@@ -222,8 +222,8 @@ def train_steps_made(diary: Diary) -> list[int]:
 
 @script("LOOP-5", "LOOP-9", "LOOP-12", "LOOP-27", uses=["run"], level=0)
 def actions_are_repeated(script: Script) -> None:
-    """Each action for three frames, or up to the end of the episode; the record has the sum of their rewards, the last
-    observation and its flags."""
+    """Each action is applied for three frames, or up to the end of the episode; the record has the sum of their
+    rewards, the last observation and its flags."""
     with runs_of(script) as runs:
         config = config_of(script)
         diary = runs.play("run", config, World(longest=17), action_repeat=3)
@@ -291,7 +291,7 @@ TABLES = ("LOOP-24", "LOOP-25", "LOOP-26", "LOOP-33")
 
 @script(*TABLES, uses=["run", "derive_seed"], level=0)
 def seeds_are_those_of_the_tables(script: Script) -> None:
-    """Of the parameters, of every policy step and every train step, and of every episode of each worker."""
+    """Parameters, policy steps, train steps and the episodes of each worker have the seeds of their numbers."""
     with runs_of(script) as runs:
         seed = script.setting.seed + 7
         diary = runs.play("run", config_of(script), seed=seed)
@@ -320,8 +320,8 @@ DRAWN = ("LOOP-4", "LOOP-26", "REP-4", "REP-7", "REP-8", "REP-9", "REP-12", "REP
 
 @script(*DRAWN, uses=["run", "derive_seed"], level=0)
 def batches_are_drawn_as_their_seeds_say(script: Script) -> None:
-    """New sequences first, then those that the numbers of this train step choose among the items of the moment, or of
-    the train step before; in a small buffer, which is full soon."""
+    """Rows are new sequences, and then those that the numbers of this train step choose among the items of the moment
+    or of the train step before; also in a small buffer, which is full soon."""
     with runs_of(script) as runs:
         for workers, ratio, capacity in ((3, 6.0, 500), (2, 14.0, 25)):
             config = config_of(script, envs=workers, replay_ratio=ratio, replay_capacity=capacity)
