@@ -123,7 +123,7 @@ def digits(numbers: np.ndarray, base: int, count: int) -> np.ndarray:
 
 def mark_in(deter: Any) -> int:
     """The mark that `deter` [D] of a latent holds."""
-    return int(np.asarray(deter[:5], np.float64) @ 256.0 ** np.arange(5))
+    return int(np.nan_to_num(np.asarray(deter[:5], np.float64)) @ 256.0 ** np.arange(5))
 
 
 def mark_of(state: Mapping[str, np.ndarray]) -> int:
