@@ -8,15 +8,12 @@ samples instead. Functions named `draw_...` sample with a generator of their own
 adapter is in docs/adapters.md.
 """
 
-import importlib
-import inspect
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
 
-from conformance.compare import DTYPES
-from conformance.serve import OBJECTS as OBJECTS
+from conformance.running.interface import RunEnvironment, RunLearner, RunOptions
 from spec import Config, Parameter, Spaces
 
 Array = np.ndarray
@@ -392,6 +389,28 @@ class Adapter(Protocol):
     ) -> Arrays: ...
     def environment_action(self, action: Array, spaces: Spaces, low: Arrays, high: Arrays) -> Arrays: ...
     def derive_seed(self, seed: int, purpose: str, index: int) -> int: ...
+    def run(
+        self,
+        environment: Callable[[], RunEnvironment],
+        learner: Callable[[Spaces, Config, int], RunLearner],
+        options: RunOptions,
+    ) -> Nested | None:
+        """A whole training run, in this process and with the environments and the learner that are given.
+
+        Args:
+          environment: makes one, with reset(seed=...) and step(action) as Gymnasium has them. Its bounds of actions are
+            its attributes low and high: key -> [size].
+          learner: called with spaces, config and seed, makes the learner that acts and is trained: initial_carry(envs),
+            policy(observation, is_first, carry, seed), train_step(batch, seed), state_dict(), load_state_dict(state),
+            save_carry(carry), load_carry(arrays).
+          options: what the run shall be: spaces, config, seed, steps, directory, action_repeat, evaluate_every,
+            evaluation_episodes, shared_environment, nonfinite, begin_with. Raise NotImplementedError for what the loop
+            does not have. `conformance.running.interface` says what each of these three means.
+
+        Returns:
+          None, or "episodes": score and length of each episode of training, in the order of their ends; "evaluations":
+          the mean score of each evaluation. A continued run says those since it was continued.
+        """
 
 
 class Learner(Protocol):
@@ -432,75 +451,3 @@ class Hooks(Protocol):
 
     def convert(self, array: Array) -> Any:
         """Called on every array before it is handed to a function: `convert = torch.as_tensor`."""
-
-
-INTERFACE: dict[str, tuple[str, ...]] = {
-    name: tuple(inspect.signature(function).parameters)[1:]
-    for name, function in vars(Adapter).items()
-    if inspect.isfunction(function) and not name.startswith("_")
-}
-"""Every function that the checks know -> the names of its arguments, which are given by position."""
-
-RESULTS: dict[str, tuple[str, ...]] = {
-    "bounded_normal": ("mean", "std"),
-    "kl_losses": ("dynamics", "representation"),
-    "update_return_range": ("low", "high"),
-    "laprop": ("update", "second_moment", "momentum"),
-    "optimizer_step": ("params", "state"),
-    "policy_step": ("carry", "action"),
-    **dict.fromkeys(("losses", "losses_given"), ("total", "aux")),
-    **dict.fromkeys(("train_step", "train_step_with", "train_step_given"), ("state", "aux")),
-}
-"""Functions with several results -> what these are, in their order."""
-
-_CELL = ("blocks", "norm_epsilon")
-_IMAGES = ("cnn_depth", "cnn_multipliers", "cnn_outer", "cnn_sampling", "halvings", "norm_epsilon")
-_POLICY = ("actor_min_std", "actor_max_std", "actor_unimix")
-_LAPROP = ("beta1", "beta2", "laprop_epsilon")
-CONFIG_FIELDS: dict[str, tuple[str, ...]] = {
-    "core": _CELL,
-    "prior": ("prior_layers", "norm_epsilon"),
-    "posterior": ("posterior_layers", "norm_epsilon"),
-    "observe": ("latent_unimix", "posterior_layers", *_CELL),
-    "imagine": ("latent_unimix", "prior_layers", *_CELL),
-    "observe_given": ("prior_layers", "posterior_layers", *_CELL),
-    "imagine_given": ("prior_layers", *_CELL),
-    "encoder": ("encoder_layers", *_IMAGES),
-    "decoder": ("decoder_layers", "blocks", *_IMAGES),
-    "reward_head": ("reward_layers", "norm_epsilon"),
-    "continue_head": ("continue_layers", "norm_epsilon"),
-    "actor": ("actor_layers", "norm_epsilon"),
-    "critic": ("critic_layers", "norm_epsilon"),
-    "continue_target": ("continue_target", "discount"),
-    "kl_losses": ("free_nats", "latent_unimix"),
-    "reconstruction_losses": ("vector_loss_scale",),
-    "update_return_range": ("return_decay", "return_percentile_low", "return_percentile_high"),
-    **dict.fromkeys(("sample_action", "action_log_prob", "action_entropy", "draw_actions"), _POLICY),
-    "actor_loss": ("entropy_scale",),
-    **dict.fromkeys(("critic_loss", "replay_critic_loss"), ("slow_critic_scale",)),
-    "learning_rate": ("learning_rate", "warmup_steps"),
-    "laprop": _LAPROP,
-    "optimizer_step": ("agc_clip", "agc_epsilon", "learning_rate", "warmup_steps", *_LAPROP),
-    "can_train": ("batch_size", "batch_length", "replay_capacity"),
-}
-"""Functions of one part -> what of the configuration their results depend on, but for sizes, which the shapes show
-too."""
-
-IMPLEMENTATIONS = ("numpy", "jax", "torch")
-TRAINER = "trainer"
-OUR_CANDIDATES = (*IMPLEMENTATIONS, TRAINER)
-"""What of ours can be checked: the implementations of the algorithm, and of the trainer what it has of the chapters on
-replay and the training loop."""
-
-
-def load_adapter(candidate: str, dtype: str = "float64", device: str | None = None) -> object:
-    """The adapter of one of our candidates, computing in `dtype` on `device` (None: its default).
-
-    Raises:
-      ValueError: an unknown candidate, dtype or device, or one that the candidate does not have.
-    """
-    if candidate not in OUR_CANDIDATES:
-        raise ValueError(f"unknown candidate {candidate!r}; known: {', '.join(OUR_CANDIDATES)}")
-    if dtype not in DTYPES:
-        raise ValueError(f"unknown dtype {dtype!r}; known: {', '.join(DTYPES)}")
-    return importlib.import_module(f"conformance.adapters.{candidate}_adapter").make_adapter(dtype, device)

@@ -10,9 +10,10 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from conformance.adapter import INTERFACE, OBJECTS, OUR_CANDIDATES, TRAINER, load_adapter
 from conformance.errors import UserError
 from conformance.foreign import ForeignAdapter, as_edition
+from conformance.interface import INTERFACE, OBJECTS
+from conformance.our_candidates import OUR_CANDIDATES, TRAINER, load_adapter
 from conformance.own_names import ours, ours_in
 from conformance.process import ProcessAdapter
 from conformance.serve import convert_arrays, function_of, load_file, missing_field, to_numpy

@@ -3,9 +3,9 @@
 import ast
 from pathlib import Path
 
-from conformance.adapter import OUR_CANDIDATES, TRAINER, load_adapter
 from conformance.check import CHECKS
 from conformance.execute import missing, selected_checks
+from conformance.our_candidates import OUR_CANDIDATES, TRAINER, load_adapter
 from conformance.requirements import requirements
 
 # Replay and the training loop are chapters of the reference and of the trainer, and of no backend; the trainer has no

@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from conformance.adapter import OBJECTS
 from conformance.adapters.numpy_adapter import NumpyAdapter
 from conformance.case import Call, Equal, Refused, Setting
 from conformance.check import CHECKS, Check
 from conformance.compare import WIDE, Comparisons, Unjudged, Worst, round_to
 from conformance.diagnosis import VALUES
 from conformance.execute import FAILING, CheckOptions, Result, missing, not_offered, outcome, run, run_check
+from conformance.interface import OBJECTS
 from conformance.judge import Ask, asking, copied, judge_refusal, standing_in
 from conformance.mutants import MUTANTS, Mutant, MutantAdapter
 from conformance.mutants.trial import on_the_mutant, on_the_reference

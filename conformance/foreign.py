@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from conformance.adapter import INTERFACE, OBJECTS, RESULTS, Adapter, Array
+from conformance.adapter import Adapter, Array
 from conformance.errors import UserError
+from conformance.interface import INTERFACE, OBJECTS, RESULTS
 from spec import Config
 
 MAPPINGS = frozenset(

@@ -5,11 +5,11 @@ import functools
 from collections.abc import Callable, Collection, Iterable, Iterator
 from typing import Any
 
-from conformance.adapter import INTERFACE
 from conformance.case import Case, Cases, Drawn, Setting
 from conformance.check import CHECKS, Check
 from conformance.drawing import cases
 from conformance.execute import Result, missing
+from conformance.interface import INTERFACE
 
 GRADIENTS_OF_ALL = ("gradients", "gradients_given", "loss_derivatives")
 """With one of these the gradient of every loss is judged."""

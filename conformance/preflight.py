@@ -16,10 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from conformance.adapter import load_adapter
 from conformance.case import Setting
 from conformance.compare import Comparisons, Deviation, Worst
 from conformance.judge import asking
+from conformance.our_candidates import load_adapter
 from conformance.problems import (
     Problem,
     random_batch,

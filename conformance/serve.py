@@ -27,7 +27,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 PROTOCOL = 1
-OBJECTS = ("Learner", "Replay", "ReplayRatio")  # functions whose results have methods, which no message holds
+OBJECTS = ("Learner", "Replay", "ReplayRatio", "run")  # give or take what has methods, which no message holds
 DTYPES = ("bool", "uint8", "int32", "int64", "float32", "float64")
 
 

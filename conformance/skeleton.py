@@ -8,7 +8,8 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from importlib import resources
 
-from conformance.adapter import CONFIG_FIELDS, INTERFACE, Adapter, Hooks
+from conformance.adapter import Adapter, Hooks
+from conformance.interface import CONFIG_FIELDS, INTERFACE
 
 HEADER = '''"""An adapter: what `conformance check {name}` calls.
 

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from conformance.adapter import OBJECTS
 from conformance.adapters.numpy_adapter import NumpyAdapter
 from conformance.case import Call, Equal, Refused, Setting
 from conformance.check import Check
 from conformance.compare import Comparisons, Unjudged, entries
 from conformance.drawing import cases
 from conformance.execute import FAILING, outcome, run
+from conformance.interface import OBJECTS
 from conformance.judge import Ask, asking, judge_case, standing_in
 from conformance.mutants.trial import tracing
 

@@ -28,9 +28,11 @@ from typing import Any
 
 import numpy as np
 
-from conformance.adapter import INTERFACE, RESULTS, Adapter, Array, load_adapter
+from conformance.adapter import Adapter, Array
 from conformance.case import Cases, Setting, equal
 from conformance.compare import WIDE, round_to
+from conformance.interface import INTERFACE, RESULTS
+from conformance.our_candidates import load_adapter
 from conformance.problems import small_config
 from spec import Spaces, Vector, parameter_table
 from spec.worked import Call, Case, Example, examples

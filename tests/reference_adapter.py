@@ -3,8 +3,8 @@ specification again."""
 
 import dataclasses
 
-from conformance.adapter import INTERFACE, OBJECTS
 from conformance.adapters.numpy_adapter import NumpyAdapter
+from conformance.interface import INTERFACE, OBJECTS
 from spec import Config, Discrete, Image, Parameter, Spaces, Vector
 
 REFERENCE = NumpyAdapter()

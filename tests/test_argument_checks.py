@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from conformance.adapter import IMPLEMENTATIONS, load_adapter
+from conformance.our_candidates import IMPLEMENTATIONS, load_adapter
 from conformance.problems import make_problem
 from dreamer_spec.backend import learner_class
 

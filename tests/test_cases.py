@@ -8,13 +8,13 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 
-from conformance.adapter import INTERFACE, OBJECTS
 from conformance.adapters.numpy_adapter import NumpyAdapter
 from conformance.case import Call, Case, Cases, Drawn, Equal, Setting, equal, exact, judged, refused, related
 from conformance.check import CHECKS, Check, check, script
 from conformance.compare import Comparisons, Deviation, entries
 from conformance.drawing import cases
 from conformance.execute import run_check, selected_checks
+from conformance.interface import INTERFACE, OBJECTS
 from conformance.judge import asking, judge_case
 from conformance.script import Script
 from reference_numpy import rssm

@@ -7,11 +7,11 @@ import functools
 
 import pytest
 
-from conformance.adapter import load_adapter
 from conformance.case import Setting
 from conformance.check import Check
 from conformance.compare import DTYPES
 from conformance.execute import run_check, selected_checks
+from conformance.our_candidates import load_adapter
 from impl_torch import layers
 
 

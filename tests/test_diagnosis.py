@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 import torch
 
-from conformance.adapter import load_adapter
 from conformance.adapters.numpy_adapter import NumpyAdapter
 from conformance.case import Setting
 from conformance.compare import Worst
 from conformance.diagnosis import VALUES, Diagnosis, diagnose
 from conformance.execute import Result, run_check, selected_checks
 from conformance.mutants import MUTANTS, MutantAdapter, PlantedAdapter, relevant, sound, trial
+from conformance.our_candidates import load_adapter
 from impl_torch import agent as torch_agent
 from impl_torch import returns as torch_returns
 from impl_torch import world_model as torch_world_model

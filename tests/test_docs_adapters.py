@@ -69,7 +69,7 @@ def mean_kl_losses(
 
 
 def test_the_examples_of_the_document_pass(monkeypatch: pytest.MonkeyPatch) -> None:
-    example, means, given, draw, _ = blocks("python")  # the last: tests/test_own_tests.py
+    example, means, given, draw, _, _ = blocks("python")  # the others: below, and in tests/test_own_tests.py
     mine = types.ModuleType("example")
     exec(example, vars(mine))
     adapter = ModuleAdapter(mine, "float64")
@@ -92,6 +92,31 @@ def test_the_examples_of_the_document_pass(monkeypatch: pytest.MonkeyPatch) -> N
     assert sample.tolist() == [1, 0]
     assert probs.grad is not None
     assert probs.grad.tolist() == [1, 0]
+
+
+LACKING = {  # what the loop of the document does not have
+    *(
+        "a_skipped_step_leaves_the_buffer_as_it_is",
+        "evaluation_changes_nothing",
+        "a_shared_environment_changes_nothing",
+    ),
+    *("evaluations_play_new_episodes_with_fresh_noise", "an_evaluation_is_the_mean_of_whole_episodes"),
+    *("a_continued_run_is_the_run_in_one_go", "environments_that_lead_elsewhere_begin_anew"),
+    *("a_warm_start_takes_over_what_was_learned", "scores_are_plain_sums"),
+}
+
+
+@pytest.mark.parametrize("name", [name for name in CHECKS if CHECKS[name].uses == ("run",)])
+def test_the_loop_of_the_document_passes_in_what_it_has(name: str) -> None:
+    (source,) = (block for block in blocks("python") if "def run(" in block)
+    mine = types.ModuleType("loop")
+    exec(source, vars(mine))
+    result = run(name, ModuleAdapter(mine, "float64"))
+    if name == "going_on.a_failed_environment_is_replaced":
+        assert (result.status, "Broken" in result.message) == ("error", True)
+        return
+    assert (result.status == "not offered") == (name.partition(".")[2] in LACKING), result.message
+    assert result.status in ("pass", "not offered"), result.message
 
 
 def test_the_messages_of_the_document_are_valid() -> None:

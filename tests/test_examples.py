@@ -7,8 +7,9 @@ from typing import Any
 
 import pytest
 
-from conformance.adapter import INTERFACE, load_adapter
 from conformance.compare import Comparisons
+from conformance.interface import INTERFACE
+from conformance.our_candidates import load_adapter
 from conformance.requirements import chapter_of, requirements
 from conformance.worked import Worked, worked
 from docs import examples as pages

@@ -13,13 +13,15 @@ import torch
 from adapters import CHECKS, CONFIG, module, run
 
 from conformance import candidate
-from conformance.adapter import INTERFACE, OBJECTS, RESULTS, Adapter, load_adapter
+from conformance.adapter import Adapter
 from conformance.adapters.numpy_adapter import NumpyAdapter
 from conformance.candidate import ModuleAdapter, remarks
 from conformance.case import Setting
 from conformance.errors import UserError
 from conformance.execute import run_check
 from conformance.foreign import arranged
+from conformance.interface import INTERFACE, OBJECTS, RESULTS
+from conformance.our_candidates import load_adapter
 from conformance.reports import summary
 from conformance.serve import load_file, to_numpy
 from reference_numpy import networks

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from conformance import cli
-from conformance.adapter import load_adapter
 from conformance.adapters.numpy_adapter import NumpyAdapter
 from conformance.case import Cases, Setting, equal, exact, judged
 from conformance.check import Check
@@ -18,6 +17,7 @@ from conformance.commands import mutants as command
 from conformance.compare import round_to
 from conformance.execute import run_check, selected_checks
 from conformance.mutants import MUTANTS, Mutant, relevant, sound, trial
+from conformance.our_candidates import load_adapter
 from conformance.requirements import chapter_of, requirements
 from impl_torch import agent as torch_agent
 from reference_numpy import layers

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from conformance import preflight as module
-from conformance.adapter import load_adapter
 from conformance.mutants import PlantedAdapter
+from conformance.our_candidates import load_adapter
 from conformance.preflight import preflight, preflight_adapter
 from conformance.problems import Problem, make_problem, with_sampling_margin
 from impl_torch.learner import Learner

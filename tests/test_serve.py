@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 
 from conformance import process
-from conformance.adapter import OBJECTS
 from conformance.adapters.numpy_adapter import NumpyAdapter
 from conformance.case import Setting
 from conformance.execute import Result, missing, run_check, selected_checks
+from conformance.interface import OBJECTS
 from conformance.problems import small_config
 from conformance.process import CandidateError, ProcessAdapter
 from conformance.serve import BadMessage, decode, to_numpy

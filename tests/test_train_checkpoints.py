@@ -10,34 +10,13 @@ from typing import Any
 
 import pytest
 from train_fakes import EPISODE, FakeLearner
-from train_runs import Make, batches, logged, run_quietly, stored
+from train_runs import Make, logged, run_quietly, stored
 
 from dreamer_spec.disk import checkpoint
 from dreamer_spec.errors import UserError
 from dreamer_spec.training import loop, setup
 from dreamer_spec.training.resume import save
 from reference_numpy.training_loop import derive_seed
-
-
-@pytest.mark.covers("LOOP-21", "LOOP-23")
-def test_a_resumed_run_goes_on_where_it_stopped(make: Make) -> None:
-    whole = run_quietly(make(steps=120, logdir=make().logdir / "whole"))
-    with ExitStack() as stack:
-        state = setup.prepare(make(steps=60), FakeLearner, stack)
-        loop.train(state)
-        loop.finish(state)
-    half = dataclasses.replace(state.counters)
-    FakeLearner.diary.clear()
-    resumed = run_quietly(make(steps=120))
-    assert resumed.counters.records == 120
-    assert resumed.counters.starts == 2
-    assert resumed.counters.train_steps == whole.counters.train_steps, "an extra train step, or one too few"
-    assert len(batches()) == whole.counters.train_steps - half.train_steps
-    streams = stored(resumed)
-    assert [bool(stream["is_first"][0]) for stream in streams] == [True] * 4, "fresh resets begin new streams"
-    assert sum(len(stream["reward"]) for stream in streams) == 120
-    assert resumed.counters.policy_steps == 60
-    assert sum(kind == "policy" for kind, _ in FakeLearner.diary) == 30
 
 
 @pytest.mark.covers("LOOP-24", "LOOP-25", "LOOP-26")

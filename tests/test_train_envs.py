@@ -333,6 +333,7 @@ def test_random_actions_are_legal_and_cover_the_choices() -> None:
     assert (actions[:, :3].sum(axis=0) > 30).all()
     assert (actions[:, :3].sum(axis=1) == 1).all()
     assert (np.abs(actions[:, -2:]) <= 1).all()
+    assert len(np.unique(actions[:, -2:], axis=0)) == 200, "each worker draws its own"
 
 
 @pytest.mark.covers("LOOP-28")

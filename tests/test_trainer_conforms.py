@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from conformance.adapter import load_adapter
 from conformance.candidate import load_candidate
 from conformance.case import Setting
 from conformance.check import Check
 from conformance.errors import UserError
 from conformance.execute import missing, run_check, selected_checks
 from conformance.offered import offered
+from conformance.our_candidates import load_adapter
 from dreamer_spec import translation
 from dreamer_spec.envs import vector
 from dreamer_spec.training import loop, setup
@@ -38,10 +38,12 @@ def test_the_trainer_offers_all_of_its_two_chapters() -> None:
         "make_record",
         "environment_action",
         "derive_seed",
+        "run",
     ]
-    of_these = {check.name for check in selected_checks("float64") if check.name.startswith(("replay.", "training_l"))}
+    chapters = ("replay.", "training_loop.", "running_loop.", "going_on.")
+    of_these = {check.name for check in selected_checks("float64") if check.name.startswith(chapters)}
     assert set(CHECKS) == of_these
-    assert len(of_these) >= 27
+    assert len(of_these) >= 51
 
 
 def kept_at_the_end(record: Any, action: Any, latents: Any) -> Any:

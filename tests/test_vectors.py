@@ -14,12 +14,13 @@ import pytest
 import torch
 
 from conformance import cli
-from conformance.adapter import INTERFACE, load_adapter
 from conformance.adapters.numpy_adapter import NumpyAdapter
 from conformance.check import CHECKS
 from conformance.compare import DTYPES, EPSILON, WIDE
 from conformance.errors import UserError
+from conformance.interface import INTERFACE
 from conformance.mutants import MUTANTS, MutantAdapter
+from conformance.our_candidates import load_adapter
 from conformance.vectors import format as vector_format
 from conformance.vectors.reading import StoredCase, deviations, read_cases, read_index
 from conformance.vectors.recording import record

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from conformance.adapter import RESULTS
 from conformance.case import Call, Case, Cases, Related, Setting
 from conformance.cases.agent import WHOLE, bound_of
 from conformance.check import check
 from conformance.compare import Comparisons, entries
+from conformance.interface import RESULTS
 from conformance.problems import random_actions, small_config, spaces
 from reference_numpy import behavior, distributions, layers, world_model
 from reference_numpy.agent import directional_derivative

@@ -1,5 +1,5 @@
-"""Checks of spec/12-training-loop.md: what a training loop must compute exactly. What only a running loop shows is
-tested in tests/."""
+"""Checks of spec/12-training-loop.md: what a training loop must compute exactly. What only a running loop shows is in
+running_loop.py and going_on.py, and tested in tests/."""
 
 import hashlib
 import json

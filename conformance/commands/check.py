@@ -6,7 +6,6 @@ from pathlib import Path
 
 from rich.console import Console
 
-from conformance.adapter import OUR_CANDIDATES
 from conformance.candidate import candidate, remarks
 from conformance.check import Check
 from conformance.compare import DTYPES
@@ -15,6 +14,7 @@ from conformance.editions import Fit, best, by_comparison, fit, judge_twice, may
 from conformance.errors import UserError
 from conformance.execute import FAILING, CheckOptions, Result, calls_of, selected_checks
 from conformance.expected import ExpectedFailures, read_expected
+from conformance.our_candidates import OUR_CANDIDATES
 from conformance.progress import Progress
 from conformance.reports import badge, html, junit, markdown, terminal
 from conformance.results import Data, identity, result_data, write, write_text

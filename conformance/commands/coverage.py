@@ -7,9 +7,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from conformance.adapter import OUR_CANDIDATES
 from conformance.check import CHECKS
 from conformance.coverage import coverage
+from conformance.our_candidates import OUR_CANDIDATES
 from conformance.requirements import check_label, requirements
 
 

@@ -5,9 +5,9 @@ import types
 from collections.abc import Collection, Iterable, Iterator
 from typing import Any
 
-from conformance.adapter import INTERFACE
 from conformance.adapters import numpy_adapter
 from conformance.check import Check
+from conformance.interface import INTERFACE
 
 PACKAGE = "reference_numpy"
 

@@ -3,8 +3,9 @@
 import shlex
 from typing import Any
 
-from conformance.adapter import INTERFACE, OBJECTS, OUR_CANDIDATES
 from conformance.execute import CheckOptions, FailedCall, Result
+from conformance.interface import INTERFACE, OBJECTS
+from conformance.our_candidates import OUR_CANDIDATES
 from conformance.reports.values import WRITTEN_OUT, is_known, shown, size, source
 
 

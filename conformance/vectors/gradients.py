@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from conformance.adapter import INTERFACE
 from conformance.compare import Path
+from conformance.interface import INTERFACE
 from conformance.vectors.recording import Vector
 from reference_numpy import behavior, distributions, world_model
 from reference_numpy.stop_gradient import recording, replaying

@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from conformance.adapter import INTERFACE
 from conformance.adapters.numpy_adapter import NumpyAdapter
 from conformance.case import Call, Case, Equal, Setting
 from conformance.check import Check
 from conformance.compare import BOUND, DTYPES, EPSILON, Path, entries, part_of, relative_deviation, round_to, scale_of
 from conformance.drawing import cases
 from conformance.execute import missing
+from conformance.interface import INTERFACE
 from conformance.judge import copied
 from spec import Config
 

@@ -14,11 +14,11 @@ from typing import Any
 import hypothesis
 import numpy as np
 
-from conformance.adapter import INTERFACE
 from conformance.check import Check
 from conformance.compare import DTYPES, EPSILON, SMALLEST_NORMAL, WIDE
 from conformance.errors import UserError
 from conformance.execute import selected_checks
+from conformance.interface import INTERFACE
 from conformance.requirements import chapter_of
 from conformance.vectors.format import FORMAT, Table, shortest, to_json, to_npz
 from conformance.vectors.gradients import gradients

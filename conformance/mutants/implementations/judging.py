@@ -84,9 +84,9 @@ def reaching(file: str, dtype: str) -> list[Any]:
 
 def first_failure(request: Mapping[str, Any]) -> Found:
     """The first check that the candidate fails."""
-    from conformance.adapter import load_adapter
     from conformance.case import Setting
     from conformance.execute import FAILING, calls_of, run_check
+    from conformance.our_candidates import load_adapter
 
     skip = {tuple(pair) for pair in request["skip"]}
     for dtype in request["dtypes"]:
