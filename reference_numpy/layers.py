@@ -128,9 +128,8 @@ def convolution(x: Any, kernel: Any, bias: Any, stride: int) -> Array:
     result = np.zeros((*x.shape[:-3], height // stride, width // stride, len(bias)))
     for row in range(KERNEL):
         for column in range(KERNEL):
-            result += (
-                padded[..., row : row + height : stride, column : column + width : stride, :] @ kernel[row, column]
-            )
+            seen = padded[..., row : row + height : stride, column : column + width : stride, :]
+            result += seen @ kernel[row, column]
     return result + bias
 
 

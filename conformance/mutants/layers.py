@@ -55,7 +55,7 @@ MUTANTS = (
         provenance="plausible: the mathematical convolution",
         violates=("LAY-6",),
         fix="Correlate: the kernel as it is.",
-        edits={"layers.convolution": {"kernel.reshape(seen": "kernel[::-1, ::-1].reshape(seen"}},
+        edits={"layers.convolution": {"kernel[row, column]": "kernel[-1 - row, -1 - column]"}},
     ),
     Mutant(
         name="convolution_padded_on_the_other_side",
