@@ -414,7 +414,11 @@ class Adapter(Protocol):
 
 
 class Learner(Protocol):
-    """An agent and its optimizer in training. A seed says which random numbers a step draws."""
+    """An agent and its optimizer in training. A seed says which random numbers a step draws.
+
+    Two things are judged where they are there: a `policy(..., mode=True)` that acts by the mode [LOOP-71], and
+    `predict(observation, prev_action, is_first, context, seed)`, an open-loop prediction by names of observations.
+    """
 
     def state_dict(self) -> Arrays:
         """The training state under its canonical names [AGT-9]."""

@@ -204,6 +204,16 @@ def repeats_past_the_end(self: Worker, flat: np.ndarray) -> Output:
     return copy.deepcopy(observation), total, step_flags(False, terminated, truncated)
 
 
+def one_array_for_all_frames(self: Worker, flat: np.ndarray) -> Output:
+    """What the environment has written into its action is played on the frames that follow."""
+    action = {key: value[0] for key, value in self.action(flat[None]).items()}
+    self.action = lambda _: {key: value[None] for key, value in action.items()}  # type: ignore[method-assign]
+    try:
+        return Worker.step(self, flat)
+    finally:
+        del self.action
+
+
 def last_reward_alone(self: Worker, flat: np.ndarray) -> Output:
     observation, _, flags = Worker.step(self, flat)
     return observation, 0.25, flags
@@ -356,6 +366,7 @@ MISTAKES: dict[str, tuple[type[SmallLoop], ...]] = {
     "running_loop.actions_are_repeated": (
         worker_with(step=repeats_past_the_end),
         worker_with(step=last_reward_alone),
+        worker_with(step=one_array_for_all_frames),
     ),
     "running_loop.a_seed_determines_the_run": (UnseededPolicy,),
     "running_loop.a_skipped_step_leaves_the_buffer_as_it_is": (WritesBackWhatWasSkipped,),

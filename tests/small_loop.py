@@ -42,10 +42,10 @@ class Worker:
 
     def step(self, flat: np.ndarray) -> Output:
         self.actions.append(flat)
-        action = {key: value[0] for key, value in self.action(flat[None]).items()}
         total = 0.0
         try:
             for _ in range(self._options.action_repeat):
+                action = {key: value[0] for key, value in self.action(flat[None]).items()}
                 observation, reward, terminated, truncated, _ = self.env.step(action)
                 total += reward
                 if terminated or truncated:

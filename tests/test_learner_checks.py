@@ -151,6 +151,21 @@ class MomentumOfNaN(Learner):
         return metrics, latents
 
 
+class SamplesAnyway(Learner):
+    def policy(self, observation: Any, is_first: np.ndarray, carry: Any, seed: int, mode: bool = False) -> Any:
+        return super().policy(observation, is_first, carry, seed)
+
+
+class OldPrediction(Learner):
+    """Predicts with the parameters that it had first."""
+
+    first: Any = None
+
+    def predict(self, *arguments: Any) -> Any:
+        self.first = self.first or super().predict(*arguments)
+        return self.first
+
+
 class StopsForever(Learner):
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         stopped = self._stopped
@@ -163,7 +178,8 @@ MISTAKES = {
     "fresh_parameters_have_their_distribution": (OneKernelForTwo,),
     "acting_leaves_its_carry_as_it_was": (ResetsTheCarryItGets,),
     "acting_uses_the_newest_parameters": (StaleActing, StaleAfterLoading),
-    "a_state_is_everything": (Forgetful, Shared),
+    "a_state_is_everything": (Forgetful, Shared, OldPrediction),
+    "the_mode_takes_the_place_of_the_sample": (SamplesAnyway,),
     "looking_changes_nothing": (CountsItsCalls,),
     "a_step_that_is_not_finite_changes_nothing": (MomentumOfNaN, StopsForever),
     "noise_is_independent": tuple(
@@ -192,6 +208,18 @@ class Candidate(TorchAdapter):
 def test_mistakes_of_learners_are_found(check: str, kind: type[Learner]) -> None:
     result = run_check(CHECKS[f"learner.{check}"], Candidate(kind), Setting("float32", "paper"))
     assert result.status == ("pass" if kind is Learner else "fail"), result.message
+
+
+def test_a_learner_without_a_mode_is_not_judged_by_it() -> None:
+    class WithoutMode(Learner):
+        def policy(self, observation: Any, is_first: np.ndarray, carry: Any, seed: int) -> Any:  # type: ignore[override]
+            return super().policy(observation, is_first, carry, seed)
+
+    check = CHECKS["learner.the_mode_takes_the_place_of_the_sample"]
+    adapter = Candidate(WithoutMode)
+    adapter.refuses_anyhow = True  # as somebody else's
+    result = run_check(check, adapter, Setting("float32", "paper"))
+    assert (result.status, "policy has no mode" in result.message) == ("not offered", True)
 
 
 def test_a_learner_without_a_method_is_told_so() -> None:

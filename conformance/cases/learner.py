@@ -4,6 +4,7 @@ A learner says which noise it draws with a seed. What it makes of that is what t
 """
 
 import dataclasses
+import inspect
 from collections.abc import Iterator
 from typing import Any
 
@@ -30,6 +31,7 @@ from conformance.problems import Problem, make_problem, random_observations, ran
 from conformance.script import Script
 from conformance.statistics import confidence, normal_cdf
 from reference_numpy import agent as reference
+from reference_numpy import behavior, networks
 from spec import Config, Discrete, Spaces, parameter_table
 
 SEEDS = 100  # tried until rounding moves no sample of a train step into another class
@@ -206,16 +208,18 @@ def acting_leaves_its_carry_as_it_was(script: Script) -> None:
 
 @script("AGT-8", "AGT-9", "AGT-10", uses=["Learner"], level=3)
 def a_state_is_everything(script: Script) -> None:
-    """A learner that takes over a state goes on as the one that it is from, bit for bit, whatever it did before; and
-    what was given out stays as it was."""
+    """A learner that takes over a state goes on as the one that it is from, bit for bit, whatever it did before, and
+    predicts the same, if it has a `predict`; and what was given out stays as it was."""
     problem = small_problem(script)
     one, other = made(script, problem), made(script, problem, 1)
     other.train_step(problem.batch, 5)
+    predicted(other, problem)
     for seed in (1, 2):
         one.train_step(problem.batch, seed)
     kept = one.state_dict()
     given = {name: np.array(value) for name, value in kept.items()}
     other.load_state_dict(kept)
+    script.compare("predictions", predicted(other, problem), predicted(one, problem), magnitude=1.0, bound=0.0)
     for learner in (one, other):
         learner.train_step(problem.batch, 3)
     after = one.state_dict()
@@ -224,6 +228,39 @@ def a_state_is_everything(script: Script) -> None:
     moved = [name for name in given if not np.array_equal(after[name], given[name])]
     for part in ("params/", "slow_critic/", "optimizer/second_moment/", "optimizer/momentum/", "return_range/"):
         script.holds(f"a train step changes {part}...", any(name.startswith(part) for name in moved))
+
+
+def predicted(learner: Any, problem: Problem) -> dict[str, np.ndarray]:
+    """The open-loop prediction of the batch after its first step; {} where the learner has none."""
+    if not callable(getattr(learner, "predict", None)):
+        return {}
+    batch = problem.batch
+    observation = {key: batch[key] for key in problem.spaces.observations}
+    found = learner.predict(observation, batch["prev_action"], batch["is_first"], 1, 4)
+    return {name: np.asarray(value) for name, value in found.items()}
+
+
+@script("LOOP-71", uses=["Learner"], level=3, dtypes=WHOLE)
+def the_mode_takes_the_place_of_the_sample(script: Script) -> None:
+    """Of a learner whose `policy` has a `mode`: the mean of each number and the first most probable class, after the
+    same sampled latents."""
+    problem = small_problem(script)
+    learner = made(script, problem)
+    if "mode" not in inspect.signature(learner.policy).parameters:
+        raise NotImplementedError("policy has no mode")
+    state = random_state(script.setting.rng(), problem.config, problem.spaces, script.setting.dtype)
+    learner.load_state_dict(reference.flatten_state(state))
+    observation = random_observations(np.random.default_rng(1), problem.spaces, (ROWS,))
+    first = np.ones(ROWS, bool)
+    _, latents, _ = learner.policy(observation, first, learner.initial_carry(ROWS), 3)
+    action, same, _ = learner.policy(observation, first, learner.initial_carry(ROWS), 3, mode=True)
+    script.compare("latents", same, latents, magnitude=1.0, bound=0.0)
+    stoch = np.eye(problem.config.classes)[np.asarray(latents["stoch"])]
+    feature = networks.feature(np.asarray(latents["deter"], np.float64), stoch)
+    expected = behavior.mode_action(
+        networks.actor(state["params"], feature, problem.spaces, problem.config), problem.spaces, problem.config
+    )
+    script.compare("action", action, expected, magnitude=1.0, bound=bound_of(script.setting, 1e-6, 1e-3))
 
 
 @script("LOOP-18", "LOOP-25", uses=["Learner"], level=3)

@@ -222,11 +222,11 @@ def train_steps_made(diary: Diary) -> list[int]:
 
 @script("LOOP-5", "LOOP-9", "LOOP-12", "LOOP-27", uses=["run"], level=0)
 def actions_are_repeated(script: Script) -> None:
-    """Each action is applied for three frames, or up to the end of the episode; the record has the sum of their
-    rewards, the last observation and its flags."""
+    """Each action is applied for three frames, or up to the end of the episode, whatever the environment writes into
+    the one that it is given; the record has the sum of their rewards, the last observation and its flags."""
     with runs_of(script) as runs:
         config = config_of(script)
-        diary = runs.play("run", config, World(longest=17), action_repeat=3)
+        diary = runs.play("run", config, World(longest=17, scribbles=True), action_repeat=3)
     records = compare_batches(script, diary, config)
     compare_actions(script, diary, records)
     script.exact("records", len(records), STEPS)

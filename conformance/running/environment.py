@@ -28,11 +28,13 @@ class World:
 
     longest: frames of the longest episodes, the reset not counted. repeatable: whether an episode is a function of its
     seed and its actions. fails: (number of an environment, in the order of their first resets; its frame that raises).
+    scribbles: whether they write into the actions that they are given, as some do.
     """
 
     longest: int = LONGEST
     repeatable: bool = True
     fails: tuple[int, int] | None = None
+    scribbles: bool = False
 
 
 class CountingEnvironment:
@@ -64,6 +66,9 @@ class CountingEnvironment:
 
     def step(self, action: Mapping[str, Any]) -> tuple[Mapping[str, np.ndarray], float, bool, bool, dict[str, Any]]:
         given = {key: np.array(value, np.float64).reshape(-1) for key, value in action.items()}
+        if self._world.scribbles:
+            for value in (value for value in action.values() if np.ndim(value)):
+                value[...] = 1
         self._steps += 1
         if self._world.fails == (self._number, self._steps):
             self._diary.failed.append(self._number)
