@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from conformance.case import Case, Cases, Equal, Setting, exactly, judged, related
+from conformance.case import Case, Cases, Equal, Setting, equal, exactly, judged, related
 from conformance.cases.agent import (
     LOSS_BOUND,
     SAMPLING_MARGIN,
@@ -25,7 +25,15 @@ from conformance.cases.agent import (
 from conformance.cases.losses import demands_of
 from conformance.check import check, script
 from conformance.compare import Comparisons
-from conformance.problems import Problem, make_problem, problem_in
+from conformance.problems import (
+    Problem,
+    make_problem,
+    problem_in,
+    random_carry,
+    random_observations,
+    random_parameters,
+    small_config,
+)
 from conformance.script import Script
 from conformance.settled import settled
 from reference_numpy import networks, optimizer
@@ -37,6 +45,8 @@ EQUAL = dict.fromkeys(("batch_size", "batch_length", "imagination_horizon", "sto
 EQUAL_SPACES = Spaces(
     {"image": Image(16, 16, 4), "mode": Discrete((4, 4)), "position": Vector(4)}, {"action": Discrete((4, 4, 4, 4))}
 )
+# More pixels than the pieces in which image networks compute.
+PICTURES, MANY = Spaces({"image": Image(64, 64, 3)}, {"action": Discrete((2,))}), 300
 # A vector of parameters longer than the pieces in which optimizers update it, and tensors that cross their edges.
 TENSORS = {"a": (7,), "b": (3, 50_021), "c": (131_073,), "d": (2, 3, 4), "e": (300, 500), "f": (2, 140_009)}
 
@@ -96,6 +106,21 @@ def gradient_of_a_batch_is_that_of_its_rows(setting: Setting) -> Cases:
         gradient_along(c, example, whole, ["all", "all, again"], bound_of(setting, 1e-5, 5e-3))
 
     yield related(mean_of_rows, *(("gradients", one.loss_arguments) for one in (problem, *rows)))
+
+
+@check("NET-1", "NET-10", "NET-16", "CON-12", uses=["encoder", "decoder"], level=2, dtypes=WHOLE)
+def many_images_match(setting: Setting) -> Cases:
+    """Tokens of 300 images of 64 x 64, each for itself, and the images that the decoder makes of 300 states."""
+    config = small_config(setting.profile, setting.dtype)
+    rng = np.random.default_rng(setting.seed)
+    params = random_parameters(rng, config, PICTURES, setting.dtype)
+    observations = random_observations(rng, PICTURES, (MANY,))
+    state = random_carry(rng, config, (MANY,))
+    feature = setting.cast(networks.feature(state["deter"], state["stoch"]))
+    bound = bound_of(setting, 1e-9, 1e-4)
+    for name, inputs in (("encoder", observations), ("decoder", feature)):
+        arguments = (params, inputs, PICTURES, config)
+        yield equal(name, arguments, getattr(networks, name)(*arguments), magnitude="tensor", bound=bound)
 
 
 @script("RSSM-13", "RSSM-17", "RSSM-19", "CON-12", uses=["observe"], level=2, dtypes=WHOLE)

@@ -212,7 +212,8 @@ def a_state_is_everything(script: Script) -> None:
     predicts the same, if it has a `predict`; and what was given out stays as it was."""
     problem = small_problem(script)
     one, other = made(script, problem), made(script, problem, 1)
-    other.train_step(problem.batch, 5)
+    for seed in (5, 6, 7):  # more updates than the state that it takes over has
+        other.train_step(problem.batch, seed)
     predicted(other, problem)
     for seed in (1, 2):
         one.train_step(problem.batch, seed)
@@ -279,10 +280,10 @@ def looking_changes_nothing(script: Script) -> None:
     script.compare("the state", asked.state_dict(), quiet.state_dict(), magnitude=1.0, bound=0.0)
 
 
-@script("LOOP-40", uses=["Learner"], level=3)
+@script("LOOP-40", "LOOP-41", uses=["Learner"], level=3)
 def a_step_that_is_not_finite_changes_nothing(script: Script) -> None:
-    """A NaN among the rewards of the batch leaves the whole state as it was and is counted; a learner that has taken
-    over a state goes on."""
+    """A NaN among the rewards of the batch leaves the whole state as it was and is counted. Of the steps that follow
+    all are made or, by a learner that stops, none until it takes over a state."""
     problem = small_problem(script)
     learner = made(script, problem)
     learner.train_step(problem.batch, 1)
@@ -292,8 +293,10 @@ def a_step_that_is_not_finite_changes_nothing(script: Script) -> None:
     metrics, _ = learner.train_step({**problem.batch, "reward": reward}, 2)
     script.exact("skipped", float(metrics["skipped"]), 1.0)
     script.compare("the state after it", learner.state_dict(), before, magnitude=1.0, bound=0.0)
+    skipped = [float(learner.train_step(problem.batch, seed)[0]["skipped"]) for seed in (3, 4, 5)]
+    script.holds("of the steps that follow all are made or none", len(set(skipped)) == 1)
     learner.load_state_dict(before)
-    metrics, _ = learner.train_step(problem.batch, 3)
+    metrics, _ = learner.train_step(problem.batch, 6)
     script.exact("skipped, of a step with finite numbers", float(metrics["skipped"]), 0.0)
     after = learner.state_dict()
     script.holds("it goes on", any(not np.array_equal(after[name], value) for name, value in before.items()))
