@@ -33,7 +33,7 @@ SUITES: Mapping[str, Suite] = {
     "atari": Suite("atari", ("ale_py",), "atari", repeats=True, limits=True),
     "atari100k": Suite("atari", ("ale_py",), "atari", repeats=True, limits=True),
     "procgen": Suite("procgen", ("procgen", "gym3"), "procgen"),
-    "dmlab": Suite("dmlab", ("deepmind_lab",), "", repeats=True),
+    "dmlab": Suite("dmlab", ("deepmind_lab",), "", repeats=True, limits=True),
     "dmc": Suite("dm_control", ("dm_control",), "dm-control", repeats=True, limits=True),
     "dmc_vision": Suite("dm_control", ("dm_control",), "dm-control", repeats=True, limits=True),
     "bsuite": Suite("bsuite", ("bsuite",), "bsuite"),
