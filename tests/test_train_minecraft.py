@@ -1,0 +1,438 @@
+"""Minecraft Diamond: what is ours of it, the calls of MineRL against a stand-in, and against MineRL's own Python layer
+where it is installed: its spaces, its commands, the schema of its missions. The game itself is in none of them."""
+
+import copy
+import importlib
+import importlib.metadata
+import inspect
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dreamer_spec.cli import parse
+from dreamer_spec.envs import ContractEnv, factory, suites
+from dreamer_spec.envs import make_env as make_task
+from dreamer_spec.envs.suites import Play, minecraft
+from dreamer_spec.envs.suites.minecraft import (
+    CHOICES,
+    IDLE,
+    KEYS,
+    Held,
+    MinecraftEnv,
+    controls,
+    counts,
+    levels,
+    make,
+    one_hot,
+    reached,
+)
+from dreamer_spec.errors import UserError
+from dreamer_spec.suites import protocol
+from spec import Image, Vector, benchmarks
+
+ENTRY = benchmarks()["minecraft"]
+ACTIONS, MILESTONES = ENTRY["actions"], ENTRY["milestones"]
+ITEMS = sorted({"air", "dirt", "log", "log2", *MILESTONES})
+EQUIPMENT = ["air", "iron_pickaxe", "other", "stone_pickaxe"]
+
+
+# The protocol
+
+
+def test_the_actions_are_the_twenty_five_of_the_decision() -> None:
+    assert len(ACTIONS) == 25
+    assert list(ACTIONS)[:12] == [
+        *("noop", "attack", "look_up", "look_down", "look_left", "look_right"),
+        *("forward", "back", "left", "right", "jump", "place_dirt"),
+    ]
+    for action in ACTIONS.values():
+        assert set(action) <= {*KEYS, *CHOICES, "camera"}
+    said = {name: action for name, action in ACTIONS.items() if set(action) & set(CHOICES)}
+    assert len(said) == 14  # placing dirt, and the 13
+    words = {"place": "place", "equip": "equip", "craft": "craft", "nearbyCraft": "craft", "nearbySmelt": "smelt"}
+    for name, action in said.items():
+        ((kind, item),) = action.items()
+        assert name == f"{words[kind]}_{item}"
+    looks = {name: action["camera"] for name, action in ACTIONS.items() if "camera" in action}
+    assert looks == {"look_up": [-15, 0], "look_down": [15, 0], "look_left": [0, -15], "look_right": [0, 15]}
+
+
+def test_the_milestones_are_the_papers_twelve() -> None:
+    words = (
+        "log, planks, stick, crafting table, wooden pickaxe, cobblestone, stone pickaxe, iron ore, furnace, "
+        "iron ingot, iron pickaxe, diamond"
+    )
+    assert [item.replace("_", " ") for item in MILESTONES] == words.split(", ")
+
+
+@pytest.mark.parametrize(("profile", "jump", "envs"), [("paper", 4, 64), ("official", 10, 16)])
+def test_the_protocol_of_a_run(profile: str, jump: int, envs: int) -> None:
+    run = parse(["--backend", "jax", "--task", "minecraft:diamond", "--profile", profile])
+    assert (run.steps, run.time_limit, run.action_repeat, run.config.envs) == (100_000_000, 36_000, 1, envs)
+    expected = {"jump_steps": jump, "break_speed": 100.0, "pitch_limit": 60, "health_reward": 0.01}
+    assert run.env_arg == expected == protocol("minecraft", profile)["env"]
+    assert run.info_metrics == "milestones/*"
+    defaults = {name: entry.default for name, entry in inspect.signature(make).parameters.items() if name != "play"}
+    assert defaults == protocol("minecraft", "paper")["env"]
+
+
+# The rules
+
+
+def sent(names: list[str], jump_steps: int = 4, pitch_limit: float = 60) -> list[dict[str, Any]]:
+    """What the engine gets for actions, one after the other from a reset."""
+    held, found = Held(), []
+    for name in names:
+        action, held = controls(ACTIONS[name], held, jump_steps, pitch_limit)
+        found.append(action)
+    return found
+
+
+def test_an_action_presses_its_keys_and_no_other() -> None:
+    for name, action in ACTIONS.items():
+        (found,) = sent([name])
+        assert list(found) == list(IDLE)
+        assert found["camera"].dtype == np.float32
+        changed = {key: value for key, value in found.items() if key != "camera" and value != IDLE[key]}
+        assert changed == {key: value for key, value in action.items() if key != "camera"}
+        np.testing.assert_array_equal(found["camera"], action.get("camera", [0, 0]))
+
+
+@pytest.mark.parametrize("steps", [1, 4, 10])
+def test_a_jump_is_held_with_forward_and_the_step_that_chose_it_counts(steps: int) -> None:
+    found = sent(["jump", *["attack"] * 12], steps)
+    assert [action["jump"] for action in found] == [1] * steps + [0] * (13 - steps)
+    assert [action["forward"] for action in found] == [1] * steps + [0] * (13 - steps)
+    assert [action["attack"] for action in found] == [0] + [1] * 12
+
+
+def test_jumping_again_holds_it_anew() -> None:
+    assert [action["jump"] for action in sent(["jump", "noop", "jump", *["noop"] * 5])] == [1] * 6 + [0] * 2
+
+
+def test_the_view_stops_at_the_limit() -> None:
+    found = sent(["look_down"] * 6 + ["look_up"] * 10 + ["look_left"] * 30 + ["look_down"])
+    pitches = [int(action["camera"][0]) for action in found]
+    assert pitches == [15] * 4 + [0] * 2 + [-15] * 8 + [0] * 2 + [0] * 30 + [15]
+    assert [int(action["camera"][1]) for action in found] == [0] * 16 + [-15] * 30 + [0]
+    assert [int(action["camera"][0]) for action in sent(["look_up"] * 3, pitch_limit=30)] == [-15, -15, 0]
+
+
+def test_both_kinds_of_log_are_counted_together() -> None:
+    found = counts({"log": np.array(2), "log2": np.array(3), "air": np.array(30)})
+    assert found == {"log": 5, "air": 30}
+
+
+def test_a_milestone_is_reached_once_and_not_by_what_was_there() -> None:
+    none = dict.fromkeys(ITEMS, 0)
+    assert reached(none, {**none, "log": 3, "dirt": 9}, MILESTONES) == ["log"]
+    assert reached({**none, "log": 1}, {**none, "log": 3}, MILESTONES) == []
+    assert reached(none, {**none, "planks": 4, "stick": 1}, MILESTONES) == ["planks", "stick"]
+
+
+def test_bars_are_parts_of_a_full_one() -> None:
+    found = levels({"life": np.array(20), "food": np.array(5), "air": np.array(150), "xp": np.array(7)})
+    assert {name: float(value) for name, value in found.items()} == {"health": 1, "hunger": 0.25, "breath": 0.5}
+    assert one_hot("air", EQUIPMENT).tolist() == [1, 0, 0, 0]
+    with pytest.raises(AssertionError, match="compass"):
+        one_hot("compass", EQUIPMENT)
+
+
+# The engine's calls
+
+
+class Engine:
+    """MineRL's environment as far as it is used: an environment of the old Gym. `coming` is what the next steps give,
+    changes of an observation each, with `died` and `info` beside."""
+
+    def __init__(self) -> None:
+        types = SimpleNamespace(values=np.array(EQUIPMENT))
+        inventory = SimpleNamespace(spaces=dict.fromkeys(ITEMS))
+        self.observation_space = {"inventory": inventory, "equipped_items": {"mainhand": {"type": types}}}
+        self.calls: list[Any] = []
+        self.coming: list[dict[str, Any]] = []
+        self.inventory: dict[str, int] = dict.fromkeys(ITEMS, 0)
+        self.life, self.equipped, self.done = 20.0, "air", True
+
+    def seed(self, seed: int | None = None, seed_spaces: bool = True) -> None:
+        assert type(seed) is int
+        assert not seed_spaces
+        self.calls.append(("seed", seed))
+
+    def reset(self) -> dict[str, Any]:
+        self.calls.append("reset")
+        self.inventory, self.life, self.equipped = dict.fromkeys(ITEMS, 0) | {"air": 36}, 20.0, "air"
+        self.done = False
+        return self._observation()
+
+    def step(self, action: dict[str, Any]) -> tuple[dict[str, Any], float, bool, dict[str, Any]]:
+        if self.done:
+            raise RuntimeError("Attempted to step an environment server with done=True")
+        self.calls.append(action)
+        change = dict(self.coming.pop(0)) if self.coming else {}
+        self.done, info = change.pop("died", False), change.pop("info", {})
+        self.life, self.equipped = change.pop("life", self.life), change.pop("equipped", self.equipped)
+        self.inventory |= change
+        return self._observation(), 0.0, self.done, info
+
+    def _observation(self) -> dict[str, Any]:
+        return {
+            "pov": np.zeros((64, 64, 3), np.uint8)[::-1],
+            "inventory": {item: np.array(count) for item, count in self.inventory.items()},
+            "equipped_items": {"mainhand": {"type": self.equipped, "damage": np.array(0)}},
+            "life_stats": {"life": np.array(self.life), "food": np.array(20), "air": np.array(300)},
+        }
+
+    def close(self) -> None:
+        self.calls.append("close")
+
+
+def played(
+    engine: Any, monkeypatch: pytest.MonkeyPatch, time_limit: int | None = 36_000, **arguments: Any
+) -> ContractEnv:
+    """As a run plays it: through the factory, with an engine that is there already."""
+    entry = {**protocol("minecraft", "paper")["env"], **arguments}
+    del entry["break_speed"]
+    monkeypatch.setattr(suites, "make", lambda play, _: MinecraftEnv(engine, play, **entry))
+    return factory.make_env("minecraft:diamond", time_limit=time_limit)
+
+
+def chosen(name: str) -> np.ndarray:
+    return np.eye(25, dtype=np.float32)[list(ACTIONS).index(name)]
+
+
+def test_the_spaces(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = played(Engine(), monkeypatch)
+    bars = dict.fromkeys(("health", "hunger", "breath"), Vector(1))
+    items = Vector(len(ITEMS) - 1)
+    assert env.spaces.observations == {
+        **{"image": Image(64, 64, 3), "inventory": items, "inventory_max": items, "equipped": Vector(4), **bars}
+    }
+    assert env.spaces.action_size == 25
+
+
+def test_an_episode(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Milestones pay 1, once; ten hearts pay a hundredth; the maximum remembers; diamond ore ends nothing."""
+    engine = Engine()
+    env = played(engine, monkeypatch)
+    first, _ = env.reset(seed=0)
+    place = [item for item in ITEMS if item != "log2"].index
+    assert first["inventory"][place("air")] == 36
+    engine.coming = [
+        {"log2": 1},
+        {"log": 2},
+        {"log": 0, "log2": 0, "planks": 4, "life": 10.0},
+        {"planks": 0},
+        {"planks": 4, "life": 15.0},
+        {"diamond": 1, "equipped": "iron_pickaxe"},
+        {"life": 0.0, "died": True},
+    ]
+    steps = [env.step(chosen("attack")) for _ in range(7)]
+    rewards = [reward for _, reward, *_ in steps]
+    np.testing.assert_allclose(rewards, [1, 0, 1 - 0.005, 0, 0.0025, 1, -0.0075], atol=1e-7)
+    assert [step[2:4] for step in steps] == [(False, False)] * 6 + [(True, False)]
+    records = [record for record, *_ in steps]
+    assert [record["inventory"][place("log")] for record in records] == [1, 3, 0, 0, 0, 0, 0]
+    assert [record["inventory_max"][place("log")] for record in records] == [1, 3, 3, 3, 3, 3, 3]
+    assert [float(record["health"][0]) for record in records] == [1, 1, 0.5, 0.5, 0.75, 0.75, 0]
+    assert [EQUIPMENT[record["equipped"].argmax()] for record in records] == ["air"] * 5 + ["iron_pickaxe"] * 2
+    assert records[0]["inventory"].dtype == np.float32
+    np.testing.assert_array_equal(records[0]["hunger"], [1])
+
+
+@pytest.mark.covers("LOOP-29")
+def test_an_episode_keeps_nothing_of_the_one_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    engine = Engine()
+    env = played(engine, monkeypatch)
+    env.reset(seed=0)
+    engine.coming = [{"log": 5, "life": 3.0}]
+    env.step(chosen("jump"))
+    for _ in range(4):
+        env.step(chosen("look_down"))
+    record, _ = env.reset()
+    assert record["inventory_max"].sum() == record["inventory"].sum() == 36
+    engine.coming = [{"log": 1}]
+    assert env.step(chosen("look_down"))[1] == 1
+    assert (engine.calls[-1]["jump"], engine.calls[-1]["camera"][0]) == (0, 15)
+
+
+def test_the_factor_of_health_and_the_jump_are_arguments(monkeypatch: pytest.MonkeyPatch) -> None:
+    engine = Engine()
+    env = played(engine, monkeypatch, health_reward=0.1, jump_steps=10, pitch_limit=15)
+    env.reset(seed=0)
+    engine.coming = [{"life": 18.0}]
+    assert env.step(chosen("jump"))[1] == pytest.approx(-0.01)
+    for _ in range(10):
+        env.step(chosen("look_up"))
+    assert [call["jump"] for call in engine.calls[2:]] == [1] * 10 + [0]
+    assert [int(call["camera"][0]) for call in engine.calls[2:]] == [0, -15] + [0] * 9
+
+
+@pytest.mark.covers("LOOP-28")
+def test_the_limit_is_a_truncation(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = played(Engine(), monkeypatch, time_limit=3)
+    env.reset(seed=0)
+    assert [env.step(chosen("noop"))[2:4] for _ in range(3)] == [(False, False)] * 2 + [(False, True)]
+
+
+@pytest.mark.covers("LOOP-33")
+def test_every_reset_asks_for_the_world_of_its_seed(monkeypatch: pytest.MonkeyPatch) -> None:
+    engines = [Engine(), Engine()]
+    for engine in engines:
+        env = played(engine, monkeypatch)
+        env.reset(seed=3)
+        env.reset()
+        env.reset()
+    calls = engines[0].calls
+    assert calls == engines[1].calls
+    assert [call if call == "reset" else call[0] for call in calls] == ["seed", "reset"] * 3
+    seeds = [call[1] for call in calls[::2]]
+    assert len(set(seeds)) == 3
+    assert all(0 <= seed < 2**31 for seed in seeds)
+
+
+@pytest.mark.covers("LOOP-32")
+def test_a_lost_game_is_a_failure_and_no_record(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The engine says it in the info, beside an observation that was drawn at random."""
+    engine = Engine()
+    env = played(engine, monkeypatch)
+    env.reset(seed=0)
+    engine.coming = [{"died": True, "diamond": 7, "info": {"error": "Connection timed out!"}}]
+    with pytest.raises(RuntimeError, match="MineRL lost its game: Connection timed out!"):
+        env.step(chosen("noop"))
+
+
+def test_the_milestones_are_in_the_info_of_every_step() -> None:
+    engine = Engine()
+    env = MinecraftEnv(engine, Play("minecraft", "diamond", render=True), 4, 60, 0.01)
+    record, _ = env.reset(seed=0)
+    assert env.render_mode == "rgb_array"
+    assert env.render() is record["image"]
+    engine.coming = [{"log": 1}, {"log": 0}]
+    for _ in range(2):
+        info = env.step(0)[4]
+        assert info == {"milestones": {item: float(item == "log") for item in MILESTONES}}
+    env.close()
+    assert engine.calls[-1] == "close"
+
+
+def test_there_is_one_task_and_without_the_engine_the_page_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(UserError, match="unknown task 'minecraft:wood'; known: diamond"):
+        make_task("minecraft:wood")
+    monkeypatch.setitem(sys.modules, "minerl", None)
+    monkeypatch.setitem(sys.modules, "minerl.herobraine.env_spec", None)
+    with pytest.raises(UserError, match=r"needs the package minerl\S*: see docs/suites.md"):
+        make_task("minecraft:diamond")
+
+
+# With MineRL's own Python layer
+
+
+def minerl(name: str = "") -> Any:
+    minecraft._name_old_types()
+    pytest.importorskip("minerl.herobraine.env_spec", reason="MineRL 0.4.4 is not installed")
+    return importlib.import_module(f"minerl{name}")
+
+
+def real_task() -> Any:
+    minerl()
+    return minecraft.engine_task(64, 100.0)
+
+
+def test_the_engines_spaces_take_every_action_and_have_every_item() -> None:
+    task = real_task()
+    nothing = task.action_space.no_op()
+    assert {key: value for key, value in nothing.items() if key != "camera"} == {
+        key: value for key, value in IDLE.items() if key != "camera"
+    }
+    for name in ACTIONS:
+        for action in sent(["jump", name]):
+            assert all(action[key] in task.action_space[key] for key in action), name
+    items = task.observation_space["inventory"].spaces
+    assert {*MILESTONES, "air", "log", "log2"} <= set(items)
+    assert list(items) == sorted(items)
+    assert len(items) == 392
+
+
+def test_the_mission_is_valid_by_the_engines_schema_and_says_what_the_protocol_says() -> None:
+    etree = pytest.importorskip("lxml.etree")
+    folder = Path(minerl().__file__).parent / "Malmo" / "Schemas"
+    schema = etree.XMLSchema(etree.parse(str(folder / "Mission.xsd")))
+    mission = etree.fromstring(real_task().to_xml().encode())
+    assert schema.validate(mission), schema.error_log
+    names = {"m": "http://ProjectMalmo.microsoft.com"}
+    assert [float(found.text) for found in mission.findall(".//m:BreakSpeedMultiplier", names)] == [100.0]
+    assert [found.get("forceReset") for found in mission.findall(".//m:DefaultWorldGenerator", names)] == ["true"]
+    assert [int(found.text) for found in mission.findall(".//m:VideoProducer/m:Width", names)] == [64]
+    assert mission.findall(".//m:RewardForCollectingItem", names) == []
+    assert mission.findall(".//m:AgentQuitFromTouchingBlockType", names) == []
+
+
+def test_an_episode_through_the_engines_python_layer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Everything but the game: the observation that MineRL has recorded takes its place, changed by the test."""
+    fake = minerl(".env._fake")
+
+    class Recorded(fake._FakeSingleAgentEnv):  # type: ignore[misc, name-defined]
+        def __init__(self, **arguments: Any) -> None:
+            super().__init__(**arguments)
+            self.commands: list[str] = []
+            self.said: list[str] = []
+
+        def _get_fake_malmo_data(self) -> dict[str, Any]:
+            return copy.deepcopy(self._fake_malmo_data)
+
+        def _process_action(self, actor_name: str, action_in: dict[str, Any]) -> str:
+            assert self._check_action(actor_name, action_in, self.task)
+            self.commands.append(super()._process_action(actor_name, action_in))
+            return self.commands[-1]
+
+        def _send_mission(self, instance: Any, mission: Any, token: str) -> None:
+            self.said.append(f"{token}:{self._seed}")
+
+    engine = Recorded(env_spec=real_task())
+    env = played(engine, monkeypatch)
+    record, _ = env.reset(seed=0)
+    items = [item for item in engine.observation_space["inventory"].spaces if item != "log2"]
+    equipment = engine.observation_space["equipped_items"]["mainhand"]["type"].values.tolist()
+    assert record["inventory"].shape == record["inventory_max"].shape == (391,)
+    assert (record["inventory"][items.index("compass")], record["inventory"][items.index("air")]) == (1, 364)
+    assert record["equipped"].shape == (393,)
+    assert [float(record[bar][0]) for bar in ("health", "hunger", "breath")] == [1, 1, 1]
+    assert record["image"].shape == (64, 64, 3)
+    assert record["image"].std() > 0
+    data = engine._fake_malmo_data
+    for index, kind in enumerate(("log", "log2", "planks"), 1):
+        data["inventory"][index] |= {"type": kind, "quantity": index}
+    data["equipped_items"]["mainhand"] |= {"type": "stone_pickaxe", "metadata": 0}
+    data |= {"life": 16.0, "food": 10, "air": 30}
+    record, reward, terminated, truncated, _ = env.step(chosen("jump"))
+    assert reward == pytest.approx(2 - 0.01 * 4 / 20)
+    assert (terminated, truncated) == (False, False)
+    assert (record["inventory"][items.index("log")], record["inventory"][items.index("planks")]) == (3, 3)
+    assert equipment[record["equipped"].argmax()] == "stone_pickaxe"
+    np.testing.assert_allclose([record[bar][0] for bar in ("health", "hunger", "breath")], [0.8, 0.5, 0.1], atol=1e-7)
+    for name in ACTIONS:
+        env.step(chosen(name))
+    expected = {
+        "craft_planks": "craft planks",
+        "craft_furnace": "craftNearby furnace",
+        "smelt_iron_ingot": "smeltNearby iron_ingot",
+        "equip_stone_pickaxe": "equip stone_pickaxe",
+        "place_dirt": "place dirt",
+        "look_left": "camera 0.0 -15.0",
+        "attack": "attack 1",
+    }
+    for name, command in expected.items():
+        assert command in engine.commands[1 + list(ACTIONS).index(name)].splitlines(), name
+    assert engine.said[0].rpartition(":")[2].isdigit()
+
+
+def test_another_version_of_the_package_is_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    minerl()
+    monkeypatch.setattr(importlib.metadata, "version", lambda _: "1.0.2")
+    with pytest.raises(UserError, match=r"needs minerl==0.4.4, and 1.0.2 is installed: see docs/suites.md"):
+        make_task("minecraft:diamond")
