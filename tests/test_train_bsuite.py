@@ -70,7 +70,7 @@ def test_each_layer_draws_from_the_seed_of_the_reset_and_its_configuration_stays
         game = Layer()
         outer = Layer(Layer(game, draws=False))
         outer.draw()
-        reseed(outer, seed)
+        reseed(outer, [seed, 0])
         assert game._mapping_rng.rand() == np.random.RandomState(42).rand()
         return [outer.draw(), game.draw()]
 
@@ -97,7 +97,7 @@ def test_discount_zero_is_terminal_and_any_other_end_is_not(discount: float, fla
         def reset(self) -> Any:
             return self.step(0)
 
-    env = BsuiteEnv(Ends())
+    env = BsuiteEnv(Ends(), 0)
     assert env.reset()[0].tolist() == [0, 1, 2, 3, 4, 5]
     observation, _, *ends, info = env.step(0)
     assert tuple(ends) == flags
@@ -221,7 +221,7 @@ def test_every_configuration_plays_and_none_outlasts_its_budget() -> None:
         if experiment.startswith("mnist"):
             continue
         package_env = package().load(experiment, configurations()[name])
-        env = BsuiteEnv(package_env)
+        env = BsuiteEnv(package_env, 0)
         stay = 1 if env.action_space.n == 3 else 0
         balances = experiment.startswith("cartpole") and "swingup" not in experiment
         episode = play(env, 3, balance if balances else lambda _, stay=stay: stay)
@@ -246,7 +246,7 @@ def test_an_episode_is_a_function_of_its_seed_and_its_actions() -> None:
         experiment = name.split("/")[0]
         if experiment.startswith("mnist") or not name.endswith("/3"):
             continue
-        envs = [BsuiteEnv(package().load(experiment, arguments)) for _ in range(2)]
+        envs = [BsuiteEnv(package().load(experiment, arguments), 3) for _ in range(2)]
         for seed in (11, 12):
             play(envs[0], seed, lambda _: 0)
 
@@ -261,6 +261,14 @@ def test_an_episode_is_a_function_of_its_seed_and_its_actions() -> None:
             one.rewards == first.rewards and np.array_equal(one.observations, first.observations) for one in others
         )
         assert same is (experiment in still), name
+
+
+def test_equal_configurations_draw_differently_from_one_seed() -> None:
+    package()
+    assert configurations()["catch/0"] == configurations()["catch/1"]
+    envs = [make_env(f"bsuite:{task}") for task in ("catch", "catch/0", "catch/1")]
+    starts = [[env.reset(seed=seed)[0]["observation"].argmax() for seed in range(20)] for env in envs]
+    assert starts[0] == starts[1] != starts[2]
 
 
 @pytest.mark.parametrize(("task", "size", "actions"), [("catch", 50, 3), ("catch/0", 50, 3), ("deep_sea/1", 144, 2)])
@@ -373,7 +381,7 @@ def test_the_package_scores_the_files(
     for player, (choose, limits) in {**players, "bad": (None, bad)}.items():
         written: list[dict[str, float]] = []
         logger = SimpleNamespace(write=written.append)
-        env = BsuiteEnv(wrappers.Logging(package().load(experiment, configurations()[task]), logger))
+        env = BsuiteEnv(wrappers.Logging(package().load(experiment, configurations()[task]), logger), 0)
         chance = functools.partial(at_random, env, np.random.default_rng(1))
         episodes = [play(env, seed, choose or chance) for seed in range(30 if experiment == "cartpole" else 150)]
         lines = [

@@ -248,9 +248,12 @@ def test_rendering_shows_what_was_seen_and_closing_closes(engine: list[Lab]) -> 
     assert engine[0].closed
 
 
-def test_the_renderer_can_be_chosen(engine: list[Lab]) -> None:
-    played(arguments={"renderer": "hardware"})
+def test_the_renderer_and_the_pictures_can_be_chosen(engine: list[Lab]) -> None:
+    played(arguments={"renderer": "hardware", "dataset_path": "/pictures"})
     assert engine[0].renderer == "hardware"
+    assert engine[0].config["datasetPath"] == "/pictures"
+    played()
+    assert engine[1].config["datasetPath"] == ""
 
 
 def test_an_unknown_level_is_a_line(engine: list[Lab]) -> None:

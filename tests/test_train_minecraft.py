@@ -329,6 +329,23 @@ def test_there_is_one_task_and_without_the_engine_the_page_is_named(monkeypatch:
         make_task("minecraft:diamond")
 
 
+def test_the_authors_build_of_the_package_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    def version(name: str) -> str:
+        if name == "minerl":
+            raise importlib.metadata.PackageNotFoundError(name)
+        return "0.4.3"
+
+    monkeypatch.setattr(importlib.metadata, "version", version)
+    with pytest.raises(UserError, match=r"needs minerl==0.4.4, and 0.4.3 is installed"):
+        make_task("minecraft:diamond")
+
+
+def test_another_version_of_the_package_is_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.metadata, "version", lambda _: "1.0.2")
+    with pytest.raises(UserError, match=r"needs minerl==0.4.4, and 1.0.2 is installed: see docs/suites.md"):
+        make_task("minecraft:diamond")
+
+
 # With MineRL's own Python layer
 
 
@@ -429,10 +446,3 @@ def test_an_episode_through_the_engines_python_layer(monkeypatch: pytest.MonkeyP
     for name, command in expected.items():
         assert command in engine.commands[1 + list(ACTIONS).index(name)].splitlines(), name
     assert engine.said[0].rpartition(":")[2].isdigit()
-
-
-def test_another_version_of_the_package_is_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    minerl()
-    monkeypatch.setattr(importlib.metadata, "version", lambda _: "1.0.2")
-    with pytest.raises(UserError, match=r"needs minerl==0.4.4, and 1.0.2 is installed: see docs/suites.md"):
-        make_task("minecraft:diamond")

@@ -5,7 +5,7 @@ Not through the package's own wrapper, which needs the Gym of before Gymnasium.
 
 import importlib
 import inspect
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +37,7 @@ def make(play: Play) -> gymnasium.Env[Any, Any]:
         raise UserError(f"unknown task {play.task!r}; {remedy}")
     if experiment.startswith("mnist"):
         _require_mnist(play.task)
-    return BsuiteEnv(package.load(experiment, configurations[name]))
+    return BsuiteEnv(package.load(experiment, configurations[name]), int(name.partition("/")[2]))
 
 
 def _require_mnist(task: str) -> None:
@@ -56,13 +56,14 @@ class BsuiteEnv(gymnasium.Env[np.ndarray, Any]):
     """An environment of the package. Observations are one vector; an end with discount 0 is terminal ([D-111]).
 
     What a configuration is (which arm pays, what an action means in which square) was drawn when it was made. What its
-    episodes draw, the noise of rewards included, comes from the seeds of the resets: [LOOP-33].
+    episodes draw, the noise of rewards included, comes from the seeds of the resets: [LOOP-33]. number: of the
+    configuration. It enters too: many are equal but for a seed that the package leaves open.
 
     The last step's info has, under "bsuite", what the package counts for its scores, for this episode alone.
     """
 
-    def __init__(self, env: Any) -> None:
-        self._env = env
+    def __init__(self, env: Any, number: int) -> None:
+        self._env, self._number = env, number
         self._before: Mapping[str, float] = {}
         size = int(np.prod(env.observation_spec().shape))
         self.observation_space = gym.Box(-np.inf, np.inf, (size,), np.float32)
@@ -72,7 +73,7 @@ class BsuiteEnv(gymnasium.Env[np.ndarray, Any]):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
         if seed is not None:
-            reseed(self._env, seed)
+            reseed(self._env, [seed, self._number])
         step = self._env.reset()
         self._before = self._env.bsuite_info()
         return _flat(step.observation), {}
@@ -87,7 +88,7 @@ class BsuiteEnv(gymnasium.Env[np.ndarray, Any]):
         self._env.close()
 
 
-def reseed(env: Any, seed: int) -> None:
+def reseed(env: Any, seed: Sequence[int]) -> None:
     """Each layer of an environment, that of the rewards' noise or scale and the game itself, goes on from a seed of its
     own. `_rng` is what episodes draw from; what a configuration was drawn from has other names, or is not asked
     again."""

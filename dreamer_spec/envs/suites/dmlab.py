@@ -24,9 +24,12 @@ IMAGE, INSTRUCTION = "RGB_INTERLEAVED", "INSTR"  # the engine's names
 SEEDS = 2**31  # the engine's are C integers
 
 
-def make(play: Play, timeout_is_terminal: bool = True, renderer: str = "software") -> gymnasium.Env[Any, Any]:
+def make(
+    play: Play, timeout_is_terminal: bool = True, renderer: str = "software", dataset_path: str = ""
+) -> gymnasium.Env[Any, Any]:
     """A level of DMLab-30, by its name. timeout_is_terminal: of every end, as all are by the level's clock.
-    renderer: the engine's, "software" (OSMesa) or "hardware" (EGL).
+    renderer: the engine's, "software" (OSMesa) or "hardware" (EGL). dataset_path: the folder of pictures that two of
+    the psychlab levels show, where it is not written into the engine.
 
     Raises:
       UserError: no such level.
@@ -39,7 +42,7 @@ def make(play: Play, timeout_is_terminal: bool = True, renderer: str = "software
     lab = engine.Lab(
         protocol["level_folder"] + level_of(play.name),
         [IMAGE, INSTRUCTION] if reads(play.name) else [IMAGE],
-        config={"width": side, "height": side, "fps": str(FPS), "logLevel": "WARN"},
+        config={"width": side, "height": side, "fps": str(FPS), "logLevel": "WARN", "datasetPath": dataset_path},
         renderer=renderer,
     )
     return DmLabEnv(lab, play, timeout_is_terminal)

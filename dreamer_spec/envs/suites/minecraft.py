@@ -4,6 +4,7 @@ MineRL 0.4.4 has to be installed with JDK 8, and fetches the game (docs/suites.m
 its own kind, an `EnvSpec`; what comes of it is an environment of the Gym of before Gymnasium, with dictionaries.
 """
 
+import contextlib
 import importlib
 import importlib.metadata
 from collections.abc import Collection, Mapping
@@ -24,6 +25,7 @@ IDLE: Mapping[str, Any] = {**dict.fromkeys(KEYS, 0), "camera": (0, 0), **dict.fr
 FULL = {"health": ("life", 20), "hunger": ("food", 20), "breath": ("air", 300)}  # name -> the engine's, and the most
 FPS = 20
 SEEDS = 2**31
+DISTRIBUTIONS = ("minerl", "minerl-mirror")  # the second is the authors' build of the same version
 
 
 def make(
@@ -43,7 +45,7 @@ def make(
     protocol = benchmarks()["minecraft"]
     if play.name not in protocol["tasks"]:
         raise UserError(f"unknown task {play.task!r}; known: {', '.join(protocol['tasks'])}")
-    found = importlib.metadata.version("minerl")  # What it raises is a ModuleNotFoundError.
+    found = _version()
     if f"minerl=={found}" != protocol["engine"]:
         raise UserError(f"task {play.task} needs {protocol['engine']}, and {found} is installed: see docs/suites.md")
     engine = engine_task(play.image_size, break_speed).make()
@@ -115,6 +117,13 @@ class MinecraftEnv(gymnasium.Env[Any, Any]):
 
     def close(self) -> None:
         self._engine.close()
+
+
+def _version() -> str:
+    for name in DISTRIBUTIONS:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            return importlib.metadata.version(name)
+    raise ModuleNotFoundError("No module named 'minerl'", name="minerl")
 
 
 # What the environment decides by
