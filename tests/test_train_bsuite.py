@@ -50,6 +50,14 @@ def test_a_run_logs_what_scores_are_made_of() -> None:
     assert run.eval_every == 51_000
 
 
+def test_the_list_says_which_configurations_there_are(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["tasks", "bsuite"]) == 0
+    shown = capsys.readouterr().out
+    assert "bsuite:catch/0 to /19, 10,000 episodes each\n" in shown
+    assert "bsuite:cartpole/0 to /19, 1,000 episodes each\n" in shown
+    assert "experiments" not in shown
+
+
 class Layer:
     """What `reseed` sees of the package's environments."""
 

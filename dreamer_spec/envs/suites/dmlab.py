@@ -21,7 +21,6 @@ from spec import benchmarks
 
 FPS = 60  # of the levels
 IMAGE, INSTRUCTION = "RGB_INTERLEAVED", "INSTR"  # the engine's names
-SEEDS = 2**31  # the engine's are C integers
 
 
 def make(
@@ -80,7 +79,7 @@ class DmLabEnv(gymnasium.Env[Any, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        self._lab.reset(episode=0, seed=None if seed is None else seed % SEEDS)  # Its own count of episodes: none.
+        self._lab.reset(episode=0, seed=seed)  # Its own count of episodes: none.
         self._frames = 0
         self._seen = self._observation()
         return self._seen, {}

@@ -24,7 +24,6 @@ NONE, AIR, OTHER = "none", "air", "other"  # the engine's words
 IDLE: Mapping[str, Any] = {**dict.fromkeys(KEYS, 0), "camera": (0, 0), **dict.fromkeys(CHOICES, NONE)}
 FULL = {"health": ("life", 20), "hunger": ("food", 20), "breath": ("air", 300)}  # name -> the engine's, and the most
 FPS = 20
-SEEDS = 2**31
 DISTRIBUTIONS = ("minerl", "minerl-mirror")  # the second is the authors' build of the same version
 
 
@@ -83,7 +82,7 @@ class MinecraftEnv(gymnasium.Env[Any, Any]):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         if seed is not None:
-            self._engine.seed(seed % SEEDS, seed_spaces=False)  # Of the next world alone; it forgets it then.
+            self._engine.seed(seed, seed_spaces=False)  # Of the next world alone; it forgets it then.
         found = self._engine.reset()
         self._held, self._most = Held(), counts(found["inventory"])
         self._seen = self._observation(found)
