@@ -1,29 +1,25 @@
-"""Minecraft Diamond: what is ours of it, the calls of MineRL against a stand-in, and against MineRL's own Python layer
-where it is installed: its spaces, its commands, the schema of its missions. The game itself is in none of them."""
+"""Minecraft Diamond: what is ours of it, and the calls of MineRL against a stand-in. MineRL's own Python layer is in
+test_train_minerl.py; the game itself is in neither."""
 
-import copy
 import importlib
 import importlib.metadata
 import inspect
 import sys
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from minecraft_play import ACTIONS, MILESTONES, chosen, played, sent
 
 from dreamer_spec.cli import parse
-from dreamer_spec.envs import ContractEnv, factory, suites
 from dreamer_spec.envs import make_env as make_task
-from dreamer_spec.envs.suites import Play, minecraft
+from dreamer_spec.envs.suites import Play
 from dreamer_spec.envs.suites.minecraft import (
     CHOICES,
     IDLE,
     KEYS,
-    Held,
     MinecraftEnv,
-    controls,
     counts,
     levels,
     make,
@@ -32,10 +28,8 @@ from dreamer_spec.envs.suites.minecraft import (
 )
 from dreamer_spec.errors import UserError
 from dreamer_spec.suites import protocol
-from spec import Image, Vector, benchmarks
+from spec import Image, Vector
 
-ENTRY = benchmarks()["minecraft"]
-ACTIONS, MILESTONES = ENTRY["actions"], ENTRY["milestones"]
 ITEMS = sorted({"air", "dirt", "log", "log2", *MILESTONES})
 EQUIPMENT = ["air", "iron_pickaxe", "other", "stone_pickaxe"]
 
@@ -81,15 +75,6 @@ def test_the_protocol_of_a_run(profile: str, jump: int, envs: int) -> None:
 
 
 # The rules
-
-
-def sent(names: list[str], jump_steps: int = 4, pitch_limit: float = 60) -> list[dict[str, Any]]:
-    """What the engine gets for actions, one after the other from a reset."""
-    held, found = Held(), []
-    for name in names:
-        action, held = controls(ACTIONS[name], held, jump_steps, pitch_limit)
-        found.append(action)
-    return found
 
 
 def test_an_action_presses_its_keys_and_no_other() -> None:
@@ -189,20 +174,6 @@ class Engine:
 
     def close(self) -> None:
         self.calls.append("close")
-
-
-def played(
-    engine: Any, monkeypatch: pytest.MonkeyPatch, time_limit: int | None = 36_000, **arguments: Any
-) -> ContractEnv:
-    """As a run plays it: through the factory, with an engine that is there already."""
-    entry = {**protocol("minecraft", "paper")["env"], **arguments}
-    del entry["break_speed"]
-    monkeypatch.setattr(suites, "make", lambda play, _: MinecraftEnv(engine, play, **entry))
-    return factory.make_env("minecraft:diamond", time_limit=time_limit)
-
-
-def chosen(name: str) -> np.ndarray:
-    return np.eye(25, dtype=np.float32)[list(ACTIONS).index(name)]
 
 
 def test_the_spaces(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -344,105 +315,3 @@ def test_another_version_of_the_package_is_a_line(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(importlib.metadata, "version", lambda _: "1.0.2")
     with pytest.raises(UserError, match=r"needs minerl==0.4.4, and 1.0.2 is installed: see docs/suites.md"):
         make_task("minecraft:diamond")
-
-
-# With MineRL's own Python layer
-
-
-def minerl(name: str = "") -> Any:
-    minecraft._name_old_types()
-    pytest.importorskip("minerl.herobraine.env_spec", reason="MineRL 0.4.4 is not installed")
-    return importlib.import_module(f"minerl{name}")
-
-
-def real_task() -> Any:
-    minerl()
-    return minecraft.engine_task(64, 100.0)
-
-
-def test_the_engines_spaces_take_every_action_and_have_every_item() -> None:
-    task = real_task()
-    nothing = task.action_space.no_op()
-    assert {key: value for key, value in nothing.items() if key != "camera"} == {
-        key: value for key, value in IDLE.items() if key != "camera"
-    }
-    for name in ACTIONS:
-        for action in sent(["jump", name]):
-            assert all(action[key] in task.action_space[key] for key in action), name
-    items = task.observation_space["inventory"].spaces
-    assert {*MILESTONES, "air", "log", "log2"} <= set(items)
-    assert list(items) == sorted(items)
-    assert len(items) == 392
-
-
-def test_the_mission_is_valid_by_the_engines_schema_and_says_what_the_protocol_says() -> None:
-    etree = pytest.importorskip("lxml.etree")
-    folder = Path(minerl().__file__).parent / "Malmo" / "Schemas"
-    schema = etree.XMLSchema(etree.parse(str(folder / "Mission.xsd")))
-    mission = etree.fromstring(real_task().to_xml().encode())
-    assert schema.validate(mission), schema.error_log
-    names = {"m": "http://ProjectMalmo.microsoft.com"}
-    assert [float(found.text) for found in mission.findall(".//m:BreakSpeedMultiplier", names)] == [100.0]
-    assert [found.get("forceReset") for found in mission.findall(".//m:DefaultWorldGenerator", names)] == ["true"]
-    assert [int(found.text) for found in mission.findall(".//m:VideoProducer/m:Width", names)] == [64]
-    assert mission.findall(".//m:RewardForCollectingItem", names) == []
-    assert mission.findall(".//m:AgentQuitFromTouchingBlockType", names) == []
-
-
-def test_an_episode_through_the_engines_python_layer(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Everything but the game: the observation that MineRL has recorded takes its place, changed by the test."""
-    fake = minerl(".env._fake")
-
-    class Recorded(fake._FakeSingleAgentEnv):  # type: ignore[misc, name-defined]
-        def __init__(self, **arguments: Any) -> None:
-            super().__init__(**arguments)
-            self.commands: list[str] = []
-            self.said: list[str] = []
-
-        def _get_fake_malmo_data(self) -> dict[str, Any]:
-            return copy.deepcopy(self._fake_malmo_data)
-
-        def _process_action(self, actor_name: str, action_in: dict[str, Any]) -> str:
-            assert self._check_action(actor_name, action_in, self.task)
-            self.commands.append(super()._process_action(actor_name, action_in))
-            return self.commands[-1]
-
-        def _send_mission(self, instance: Any, mission: Any, token: str) -> None:
-            self.said.append(f"{token}:{self._seed}")
-
-    engine = Recorded(env_spec=real_task())
-    env = played(engine, monkeypatch)
-    record, _ = env.reset(seed=0)
-    items = [item for item in engine.observation_space["inventory"].spaces if item != "log2"]
-    equipment = engine.observation_space["equipped_items"]["mainhand"]["type"].values.tolist()
-    assert record["inventory"].shape == record["inventory_max"].shape == (391,)
-    assert (record["inventory"][items.index("compass")], record["inventory"][items.index("air")]) == (1, 364)
-    assert record["equipped"].shape == (393,)
-    assert [float(record[bar][0]) for bar in ("health", "hunger", "breath")] == [1, 1, 1]
-    assert record["image"].shape == (64, 64, 3)
-    assert record["image"].std() > 0
-    data = engine._fake_malmo_data
-    for index, kind in enumerate(("log", "log2", "planks"), 1):
-        data["inventory"][index] |= {"type": kind, "quantity": index}
-    data["equipped_items"]["mainhand"] |= {"type": "stone_pickaxe", "metadata": 0}
-    data |= {"life": 16.0, "food": 10, "air": 30}
-    record, reward, terminated, truncated, _ = env.step(chosen("jump"))
-    assert reward == pytest.approx(2 - 0.01 * 4 / 20)
-    assert (terminated, truncated) == (False, False)
-    assert (record["inventory"][items.index("log")], record["inventory"][items.index("planks")]) == (3, 3)
-    assert equipment[record["equipped"].argmax()] == "stone_pickaxe"
-    np.testing.assert_allclose([record[bar][0] for bar in ("health", "hunger", "breath")], [0.8, 0.5, 0.1], atol=1e-7)
-    for name in ACTIONS:
-        env.step(chosen(name))
-    expected = {
-        "craft_planks": "craft planks",
-        "craft_furnace": "craftNearby furnace",
-        "smelt_iron_ingot": "smeltNearby iron_ingot",
-        "equip_stone_pickaxe": "equip stone_pickaxe",
-        "place_dirt": "place dirt",
-        "look_left": "camera 0.0 -15.0",
-        "attack": "attack 1",
-    }
-    for name, command in expected.items():
-        assert command in engine.commands[1 + list(ACTIONS).index(name)].splitlines(), name
-    assert engine.said[0].rpartition(":")[2].isdigit()
