@@ -33,7 +33,7 @@ SUITES: Mapping[str, Suite] = {
     "atari": Suite("atari", ("ale_py",), "atari", repeats=True, limits=True),
     "atari100k": Suite("atari", ("ale_py",), "atari", repeats=True, limits=True),
     "procgen": Suite("procgen", ("procgen", "gym3"), "procgen"),
-    "dmlab": Suite("dmlab", ("deepmind_lab",), "", repeats=True),
+    "dmlab": Suite("dmlab", ("deepmind_lab",), "", repeats=True, limits=True),
     "dmc": Suite("dm_control", ("dm_control",), "dm-control", repeats=True, limits=True),
     "dmc_vision": Suite("dm_control", ("dm_control",), "dm-control", repeats=True, limits=True),
     "bsuite": Suite("bsuite", ("bsuite",), "bsuite"),
@@ -64,11 +64,25 @@ def settings(task: str, profile: str) -> dict[str, Any]:
     found = protocol(suite, profile) if suite else {}
     if not found:
         return {}
-    run = {name: found[name] for name in RUN if name in found}
+    if steps := _steps(found, task.partition(":")[2]):
+        found |= {"steps": steps}
+    run = {name: found[name] for name in (*RUN, "info_metrics") if name in found}
     if "steps" in found:
         run |= {"eval_every": found["steps"] // EVALUATIONS, "random_episodes": 1}
     chosen = {name: found[name] for name in hyperparameters() if name in found}
     return {**run, "env_arg": found["env"], "hyperparameters": chosen}
+
+
+def _steps(found: Mapping[str, Any], name: str) -> int | None:
+    """The budget of a configuration EXPERIMENT/NUMBER that has one in episodes: their records, resets included, if all
+    are as long as they can be. None where there is no such configuration, or the protocol knows none."""
+    experiment, _, number = name.partition("/")
+    entry, place = found.get("experiments", {}).get(experiment), number or "0"
+    if entry is None or not (place.isascii() and place.isdigit() and int(place) < entry["configurations"]):
+        return None
+    longest = entry["longest"]
+    steps: int = longest[int(place)] if isinstance(longest, list) else longest
+    return entry["episodes"] * (steps + 1)
 
 
 def in_words(task: str, values: Mapping[str, Any]) -> str | None:

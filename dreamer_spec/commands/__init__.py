@@ -1,6 +1,7 @@
 """The commands beside training: `train NAME ...` calls `main(arguments)` of the module of that name."""
 
 COMMANDS: dict[str, str] = {  # name -> what it does, for --help
+    "bsuite": "writes runs of BSuite as its package reads them, for the scores of the benchmark",
     "eval": "plays episodes with a checkpoint, on either backend",
     "export": "writes the policy of a checkpoint as a folder that runs with NumPy alone",
     "inspect": "what a train step met whose loss or gradient was not finite; what a checkpoint holds",

@@ -68,12 +68,18 @@ def _show(console: Console, suite: str) -> None:
     console.print(view)
     console.print(f"{_installed(suite)}; `--env-arg NAME=VALUE` changes what begins with env.")
     for task in tasks_of(suite):
-        console.print(f"{suite}:{task}")
+        console.print(f"{suite}:{task}{_configurations(suite, task)}")
+
+
+def _configurations(suite: str, task: str) -> str:
+    """/0 to /19, 10,000 episodes each; empty where a task is one."""
+    entry = benchmarks().get(suite, {}).get("experiments", {}).get(task)
+    return f"/0 to /{entry['configurations'] - 1}, {entry['episodes']:,} episodes each" if entry else ""
 
 
 def _flat(found: dict[str, object]) -> dict[str, object]:
-    """{"env": {"noops": 0}} -> {"env.noops": 0}, without names of tasks."""
+    """{"env": {"noops": 0}} -> {"env.noops": 0}, without lists and tables."""
     arguments = found.get("env")
     assert arguments is None or isinstance(arguments, dict)
-    plain = {name: value for name, value in found.items() if name not in ("env", "tasks")}
+    plain = {name: value for name, value in found.items() if not isinstance(value, dict | list)}
     return plain | {f"env.{name}": value for name, value in (arguments or {}).items()}
