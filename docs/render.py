@@ -210,15 +210,20 @@ def implementation_mutants() -> str:
         return f"No run of all of them is recorded yet (`{path.relative_to(ROOT)}`).\n"
     found = json.loads(path.read_text(encoding="utf-8"))["mutants"]
     rows = [[kind, *map(str, row)] for kind, row in mutant_report.counts(found).items()]
+    for name, patches in implementations.catalogues().items():
+        own = {mutant: found[mutant] for mutant in patches if mutant in found}
+        rows.append([f"all in `{name}.toml`", *map(str, mutant_report.counts(own)["all"])])
     table = markdown_table(["kind", *mutant_report.COLUMNS], rows)
     if left := len(implementations.patches()) - len(found):
         table += f"\nNot run yet: {left} of {len(implementations.patches())}.\n"
-    missed = [
-        [f"`{name}`", f"`{entry['file']}`", entry["explanation"].replace("|", "\\|")]
-        for name, entry in found.items()
-        if mutant_report.column_of(entry) == "survived"
-    ]
-    return table + ("\nSurvivors:\n\n" + markdown_table(["mutant", "file", "mistake"], missed) if missed else "")
+    for column, title in (("test", "Noticed by a test alone"), ("survived", "Survivors")):
+        rows = [
+            [f"`{name}`", f"`{entry['file']}`", entry["explanation"].replace("|", "\\|")]
+            for name, entry in found.items()
+            if mutant_report.column_of(entry) == column
+        ]
+        table += f"\n{title}:\n\n" + markdown_table(["mutant", "file", "mistake"], rows) if rows else ""
+    return table
 
 
 def train_step_table() -> str:

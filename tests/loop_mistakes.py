@@ -264,6 +264,13 @@ class NoiseOfTheFirstEvaluation(SmallLoop):
         super().evaluate(workers)
 
 
+class RandomActionsOfOneSeed(SmallLoop):
+    """Every environment gets the same actions."""
+
+    def random_action(self, rng: np.random.Generator) -> np.ndarray:
+        return super().random_action(np.random.default_rng(0))
+
+
 class MeansOfRewards(SmallLoop):
     def evaluate(self, workers: list[Worker]) -> None:
         super().evaluate(workers)
@@ -380,6 +387,7 @@ MISTAKES: dict[str, tuple[type[SmallLoop], ...]] = {
         NoiseOfTheFirstEvaluation,
     ),
     "going_on.evaluations_have_the_seeds_of_the_tables": (EvaluationsAlike, NoiseOfTheFirstEvaluation),
+    "going_on.the_random_policy_draws_for_every_environment": (RandomActionsOfOneSeed,),
     "going_on.an_evaluation_is_the_mean_of_whole_episodes": (MeansOfRewards,),
     "going_on.a_continued_run_is_the_run_in_one_go": (ForgetsOnLoading, ForgetsItsCredit, ForgetsItsQueue),
     "going_on.environments_that_lead_elsewhere_begin_anew": (ForgetsItsCredit, CountsNoStarts, GoesOnWithItsStreams),

@@ -88,6 +88,8 @@ class SmallLoop:
         if before:
             self.load(before)
         else:
+            if options.random_episodes:
+                self.play_randomly()
             if options.begin_with:
                 self.warm_start(self.saved[options.begin_with]["learner"])
             self.begin()
@@ -97,6 +99,20 @@ class SmallLoop:
             self.act_and_learn()
         self.saved[options.directory] = self.save()
         return {"episodes": self.episodes, "evaluations": self.evaluations}
+
+    def play_randomly(self) -> None:
+        """Each environment its share of the episodes, [LOOP-26]."""
+        rng = np.random.default_rng(derive_seed(self.options.seed, "random_policy", 0))
+        for place in range(2):
+            seed = derive_seed(self.options.seed, "random_environment", place)
+            worker = self.worker(self._make, seed, self.options)
+            for _ in range(self.options.random_episodes // 2):
+                output = worker.reset()
+                while not output[2]["is_last"]:
+                    output = worker.step(self.random_action(rng))
+
+    def random_action(self, rng: np.random.Generator) -> np.ndarray:
+        return rng.uniform(-1, 1, self.options.spaces.action_size).astype(np.float32)
 
     def begin(self) -> None:
         """Fresh episodes everywhere: [LOOP-26]."""

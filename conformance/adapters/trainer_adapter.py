@@ -114,7 +114,7 @@ def _options(options: RunOptions, make: Callable[[], gymnasium.Env[Any, Any]]) -
         eval_episodes=options.evaluation_episodes if options.evaluate_every else 0,
         eval_env="shared" if options.shared_environment else "own",
         nonfinite=options.nonfinite,
-        random_episodes=0,
+        random_episodes=options.random_episodes,
         checkpoint_every=float("inf"),
         log_every=float("inf"),
         processes="no",

@@ -21,7 +21,7 @@ from conformance.cases.running_loop import (
 )
 from conformance.check import script
 from conformance.running.diary import Act, Diary, Frame
-from conformance.running.environment import World
+from conformance.running.environment import HIGH, LOW, World
 from conformance.running.playing import STEPS, Runs, config_of, runs_of
 from conformance.running.records import records_of
 from conformance.script import Script
@@ -122,6 +122,30 @@ def evaluations_have_the_seeds_of_the_tables(script: Script) -> None:
             played = [resets[act.keys[row]] for act in own if act.is_first[row]]
             expected = [derived(script, worker, "episode", episode) for episode in range(len(played))]
             script.exact(f"seeds of the episodes in row {row} of evaluation {number}", played, expected)
+
+
+@script("LOOP-26", "LOOP-33", uses=["run", "derive_seed"], level=0)
+def the_random_policy_draws_for_every_environment(script: Script) -> None:
+    """Before the first policy step each environment plays episodes of its own seeds, with actions of its own that its
+    spaces allow; and the run is what it is without them."""
+    with runs_of(script) as runs:
+        plain = runs.play("plain", config_of(script), SHORT)
+        diary = runs.play("random", config_of(script), SHORT, random_episodes=6)
+    compare_learning(script, "the run", diary, plain)
+    acted = {key for act in plain.acts for key in act.keys}
+    first = next(number for number, event in enumerate(diary.events) if isinstance(event, Act))
+    frames = [event for event in diary.events[:first] if isinstance(event, Frame) and event.key not in acted]
+    environments = list(dict.fromkeys(frame.environment for frame in frames))
+    script.holds("several environments play at random", len(environments) > 1)
+    played = {number: [frame for frame in frames if frame.environment == number] for number in environments}
+    for row, own in enumerate(played.values()):
+        worker = derived(script, script.setting.seed, "random_environment", row)
+        seeds = [frame.seed for frame in own if frame.is_reset]
+        expected = [derived(script, worker, "episode", episode) for episode in range(len(seeds))]
+        script.exact(f"seeds of the episodes of environment {row}", seeds, expected)
+    actions = [frame.action["steer"] for frame in frames if frame.action]
+    script.holds("steer is in its range", np.all((LOW["steer"] <= actions) & (actions <= HIGH["steer"])))
+    script.exact("different actions of all steps", len({tuple(action) for action in actions}), len(actions))
 
 
 @script("LOOP-20", uses=["run"], level=0)

@@ -24,6 +24,7 @@ class RunOptions:
     evaluate_every: records between evaluations, 0 for none at all, not even at the end. evaluation_episodes: whole
     episodes of one evaluation. shared_environment: they are played in the environment of training, of which there is
     one [LOOP-66].
+    random_episodes: whole episodes of a policy that ignores what it sees, played before the first policy step.
     nonfinite: "stop" or "skip", what follows a train step that was skipped because a number was not finite [LOOP-41],
     [LOOP-42]. begin_with: the directory of another run, whose parameters a new one begins with [LOOP-72].
     """
@@ -37,6 +38,7 @@ class RunOptions:
     evaluate_every: int = 0
     evaluation_episodes: int = 0
     shared_environment: bool = False
+    random_episodes: int = 0
     nonfinite: str = "stop"
     begin_with: Path | None = None
 
