@@ -20,6 +20,12 @@ TWO_PLAYERS = ("combat", "joust", "maze_craze", "warlords")
 Step = tuple[dict[str, np.ndarray], float, bool, bool]
 
 
+@pytest.fixture(scope="module")
+def rom() -> Any:
+    ale_py.ALEInterface.setLoggerMode(ale_py.LoggerMode.Error)
+    return ale_py.roms.get_rom_path("seaquest")
+
+
 def made(task: str, *arguments: str) -> ContractEnv:
     """As a run has it: with the protocol of its suite."""
     return env_maker(parse(["--backend", "jax", "--task", task, *arguments]))(0)
@@ -155,6 +161,22 @@ def test_lives_do_not_end_an_episode() -> None:
     assert lives.index(0) == len(lives) - 1
 
 
+def test_the_emulator_reads_the_probability_only_when_it_loads_a_game(rom: Any) -> None:
+    """Why the authors' Atari100k is sticky, which asks for 0 after that: D-99."""
+    for before, after, several in ((0.25, 0.0, True), (0.0, 0.25, False)):
+        ale, episodes = ale_py.ALEInterface(), set()
+        ale.setFloat("repeat_action_probability", before)
+        ale.loadROM(rom)
+        ale.setFloat("repeat_action_probability", after)
+        start = ale.cloneState()  # without its generator
+        for _ in range(5):
+            ale.restoreState(start)
+            for action in np.random.default_rng(0).integers(2, 6, 100):
+                ale.act(action)
+            episodes.add(ale.getRAM().tobytes())
+        assert (len(episodes) > 1) is several
+
+
 class Watched:
     """An emulator, and what it made of each action: `could` counts the frames in which the action before would have
     changed the memory otherwise than the action that was asked for, `did` those of them in which it was the action
@@ -190,12 +212,6 @@ class Watched:
         self.oracle.restoreState(state)
         self.oracle.act(action)
         return bytes(self.oracle.getRAM().tobytes())
-
-
-@pytest.fixture(scope="module")
-def rom() -> Any:
-    ale_py.ALEInterface.setLoggerMode(ale_py.LoggerMode.Error)
-    return ale_py.roms.get_rom_path("seaquest")
 
 
 @pytest.mark.parametrize("probability", [0.25, 0.6, 0.0])
