@@ -106,7 +106,7 @@ def test_the_memory_at_power_up_is_drawn_from_the_seed_too() -> None:
     assert len({image.tobytes() for image in images}) == 3
 
 
-def test_processes_play_the_same_episodes() -> None:
+def test_processes_play_the_same_episodes(capfd: pytest.CaptureFixture[str]) -> None:
     options = parse(["--backend", "jax", "--task", "atari:pong"])
     actions = np.random.default_rng(0).integers(0, 18, (30, 2))
     records = []
@@ -120,6 +120,7 @@ def test_processes_play_the_same_episodes() -> None:
     for here, there in zip(*records, strict=True):
         assert here.keys() == there.keys()
         assert all(np.array_equal(here[key], there[key]) for key in here)
+    assert capfd.readouterr() == ("", ""), "nothing of ids of ale-py, which the process gets and the import registers"
 
 
 @pytest.mark.covers("LOOP-29")
