@@ -123,6 +123,22 @@ def test_processes_play_the_same_episodes(capfd: pytest.CaptureFixture[str]) -> 
     assert capfd.readouterr() == ("", ""), "nothing of ids of ale-py, which the process gets and the import registers"
 
 
+@pytest.mark.covers("LOOP-34")
+def test_an_episode_under_way_is_played_again() -> None:
+    """By an emulator of its own, no-ops and sticky actions included."""
+    options = parse(["--backend", "jax", "--task", "atari:alien", "--profile", "official"])
+    first, second = (Environments(env_maker(options), 1, False, task=options.task) for _ in range(2))
+    first.reset([5])
+    actions = random_actions(first.spaces, np.random.default_rng(0), 60)[:, None]
+    for action in actions[:40]:
+        record = first.step(action)
+    restored = second.restore(first.histories())
+    assert restored is not None
+    for action in actions[40:]:
+        assert all(np.array_equal(restored[key], record[key]) for key in record)
+        record, restored = first.step(action), second.step(action)
+
+
 @pytest.mark.covers("LOOP-29")
 def test_the_first_frame_shows_the_reset_screen() -> None:
     env = made("atari:ms_pacman")

@@ -100,8 +100,8 @@ class AtariEnv(gymnasium.Env[Any, Any]):
         return self._observation([self._ale.getScreenRGB()]), {}
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """The screens that are pooled are those of the last frames of the repeat; of a repeat that is cut short before
-        them, the last one."""
+        """The screens that are pooled are those of the last frames of the repeat; of one that is cut short, its last
+        one."""
         total, screens = 0.0, []
         for left in reversed(range(self._play.action_repeat)):
             total += self._ale.act(self._actions[action])
