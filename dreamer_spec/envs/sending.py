@@ -3,6 +3,7 @@ what it has imported, has registered here."""
 
 import dataclasses
 import sys
+import warnings
 from collections.abc import Iterable
 from contextlib import suppress
 from multiprocessing.reduction import ForkingPickler
@@ -25,9 +26,10 @@ def known_here() -> list[EnvSpec]:
 
 
 def register(specs: Iterable[EnvSpec]) -> None:
-    """Makes them known in this process; what is known already stays."""
-    for spec in specs:
-        gymnasium.registry.setdefault(spec.id, spec)
+    """Makes them known in this process; what is known already stays. Their package registers them once more when it is
+    imported: ale-py hundreds of them, with a warning for each."""
+    if [spec for spec in specs if gymnasium.registry.setdefault(spec.id, spec) is spec]:
+        warnings.filterwarnings("ignore", r".*Overriding environment", UserWarning)
 
 
 def _with_code(spec: EnvSpec) -> EnvSpec:
