@@ -66,7 +66,7 @@ class CrafterEnv(gymnasium.Env[Any, Any]):
         """The darkness is noise from the generator that the game plays with: it must not see that it was looked at."""
         random = self._env._world.random
         before = random.get_state()
-        picture: np.ndarray = self._env.render(np.array([RENDERED, RENDERED]))
+        picture: np.ndarray = self._env.render((RENDERED, RENDERED))
         random.set_state(before)
         return picture
 

@@ -34,11 +34,10 @@ def make(play: Play, full_view: bool = False) -> gymnasium.Env[Any, Any]:
             f"unknown task {play.task!r}{did_you_mean(play.name, known)}; known are the {len(known)} ids of the "
             f"package, such as {known[0]}"
         )
+    env = gymnasium.make(play.name, render_mode="rgb_array" if play.render else None, disable_env_checker=True)
     try:
-        env = gymnasium.make(play.name, render_mode="rgb_array" if play.render else None, disable_env_checker=True)
-    except (
-        FileNotFoundError
-    ) as error:  # Those of WFC read pictures, which the package as it is installed does not have.
+        env.reset(seed=0)
+    except FileNotFoundError as error:  # Those of WFC begin with pictures that the package as it is installed lacks.
         raise UserError(f"task {play.task}: a file of the package minigrid is missing: {error.filename}") from error
     return MiniGridEnv(env, play, full_view)
 
