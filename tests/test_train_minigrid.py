@@ -8,12 +8,14 @@ import pytest
 
 from dreamer_spec.envs import make_env
 from dreamer_spec.envs.adapter import ContractEnv
-from dreamer_spec.envs.suites.minigrid import MiniGridEnv
 from dreamer_spec.errors import UserError
 from dreamer_spec.suites import protocol, tasks_of
 from spec import Discrete, Image
 
 pytest.importorskip("minigrid", reason="MiniGrid is not installed: pip install 'dreamer-spec[minigrid]'")
+
+from dreamer_spec.envs.suites.minigrid import MiniGridEnv
+
 EMPTY = "MiniGrid-Empty-5x5-v0"
 LEFT, FORWARD = 0, 2
 
