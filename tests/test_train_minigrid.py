@@ -1,5 +1,7 @@
 """MiniGrid: every id of the package, drawn with whole pixels, reproduced by its seed."""
 
+import subprocess
+import sys
 from typing import Any
 
 import gymnasium
@@ -18,6 +20,16 @@ from dreamer_spec.envs.suites.minigrid import MiniGridEnv
 
 EMPTY = "MiniGrid-Empty-5x5-v0"
 LEFT, FORWARD = 0, 2
+SENT = f"""
+import warnings
+import gymnasium
+from gymnasium.envs.registration import EnvSpec
+from dreamer_spec.envs.sending import register
+from dreamer_spec.envs import make_env
+register([EnvSpec("{EMPTY}", "minigrid.envs:EmptyEnv")])
+warnings.simplefilter("error")
+make_env("minigrid:{EMPTY}")
+"""
 
 
 def made(name: str = EMPTY, image_size: int = 64, action_repeat: int = 1, **arguments: Any) -> ContractEnv:
@@ -108,6 +120,11 @@ def test_the_tasks_of_the_protocol_need_no_mission(name: str) -> None:
     env = made(name)
     missions = {env._env.reset(seed=seed)[1]["mission"] for seed in range(20)}
     assert len({mission.replace("the", "a") for mission in missions}) == 1  # "go to a red ball"
+
+
+def test_ids_that_came_from_another_process_are_no_news() -> None:
+    run = subprocess.run([sys.executable, "-c", SENT], capture_output=True, text=True, timeout=300)
+    assert (run.returncode, run.stderr) == (0, "")
 
 
 @pytest.mark.covers("LOOP-28")

@@ -5,10 +5,11 @@ whole number of pixels and the rest of the image is black, so that the same tile
 to the side of the image it would not.
 """
 
+import importlib
+import warnings
 from typing import Any
 
 import gymnasium
-import minigrid
 import numpy as np
 from gymnasium import spaces as gym
 
@@ -27,8 +28,7 @@ def make(play: Play, full_view: bool = False) -> gymnasium.Env[Any, Any]:
     Raises:
       UserError: no such id, one that the package cannot make, an image too small for the grid.
     """
-    gymnasium.register_envs(minigrid)
-    known = [name for name, spec in gymnasium.registry.items() if str(spec.entry_point).startswith("minigrid.")]
+    known = _registered()
     if play.name not in known:
         raise UserError(
             f"unknown task {play.task!r}{did_you_mean(play.name, known)}; known are the {len(known)} ids of the "
@@ -89,3 +89,12 @@ class MiniGridEnv(gymnasium.Env[Any, Any]):
 
     def close(self) -> None:
         self._env.close()
+
+
+def _registered() -> list[str]:
+    """The ids of the package, which registers them when it is imported."""
+    with warnings.catch_warnings():
+        # A process of an environment may know them already, from the one that began it.
+        warnings.filterwarnings("ignore", ".*Overriding environment")
+        importlib.import_module("minigrid")
+    return [name for name, spec in gymnasium.registry.items() if str(spec.entry_point).startswith("minigrid.")]
