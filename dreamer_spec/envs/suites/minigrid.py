@@ -1,8 +1,7 @@
 """MiniGrid and BabyAI as environments with an image: no suite of the paper.
 
-What the package observes are codes of tiles; here they are drawn, as most who train on pixels have it. A tile has a
-whole number of pixels and the rest of the image is black, so that the same tile looks the same wherever it lies: scaled
-to the side of the image it would not.
+What the package observes are codes of tiles; here they are drawn. A tile has a whole number of pixels and the rest of
+the image is black, so that the same tile looks the same wherever it lies: scaled to the side of the image it would not.
 """
 
 import importlib
