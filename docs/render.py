@@ -117,7 +117,8 @@ def size_table() -> str:
 
 
 def benchmark_table() -> str:
-    """Every suite; values of the profile `official` in parentheses where they differ."""
+    """Every suite, and whether its protocol is ours; values of the profile `official` in parentheses where they
+    differ."""
     names = ["steps", "action_repeat", "envs", "replay_ratio", "size", "time_limit", "observation"]
 
     def cell(suite: dict[str, Any], name: str) -> str:
@@ -130,7 +131,12 @@ def benchmark_table() -> str:
         return ", ".join(f"`{name}` {cell({**own, 'official': _official_env(suite)}, name)}" for name in own)
 
     rows = [
-        [f"`{name}`", str(len(suite["tasks"])), *(cell(suite, column) for column in names), arguments(suite)]
+        [
+            f"`{name}`" + (", ours" if suite.get("ours") else ""),
+            str(len(suite["tasks"])),
+            *(cell(suite, column) for column in names),
+            arguments(suite),
+        ]
         for name, suite in benchmarks().items()
     ]
     return markdown_table(["suite", "tasks", *names, "its environment"], rows)

@@ -5,6 +5,7 @@ ratio, instances and action repeat, and its environment its keyword arguments; a
 """
 
 import dataclasses
+import sys
 from collections.abc import Mapping
 from typing import Any
 
@@ -20,19 +21,29 @@ EVALUATIONS = 10  # within a budget; the paper's scores are those of training ep
 class Suite:
     """module: in dreamer_spec.envs.suites, whose `make` makes a task. needs: the packages to import. extra: of ours,
     which installs them; "" where pip cannot. repeats, limits: whether `make` gets the action repeat, or the time limit,
-    and sees to it by itself."""
+    and sees to it by itself. command: what installs the packages where no extra can."""
 
     module: str
     needs: tuple[str, ...]
     extra: str
     repeats: bool = False
     limits: bool = False
+    command: str = ""
+
+
+# Without dependencies: those that the build for Python 3.11 and 3.12 names put NumPy back to version 1, though it runs
+# with version 2; those for 3.13 are 400 MB that are not needed, and an older Pillow.
+_PROCGEN = (
+    (("procgen_gym",), "pip install --no-deps procgen-gym==0.1.1")
+    if sys.version_info >= (3, 13)
+    else (("procgen", "gym3", "cffi"), "pip install --no-deps procgen-mirror==0.10.7 gym3==0.3.3 cffi pycparser")
+)
 
 
 SUITES: Mapping[str, Suite] = {
     "atari": Suite("atari", ("ale_py",), "atari", repeats=True, limits=True),
     "atari100k": Suite("atari", ("ale_py",), "atari", repeats=True, limits=True),
-    "procgen": Suite("procgen", ("procgen", "gym3"), "procgen"),
+    "procgen": Suite("procgen", _PROCGEN[0], "", command=_PROCGEN[1]),
     "dmlab": Suite("dmlab", ("deepmind_lab",), "", repeats=True, limits=True),
     "dmc": Suite("dm_control", ("dm_control",), "dm-control", repeats=True, limits=True),
     "dmc_vision": Suite("dm_control", ("dm_control",), "dm-control", repeats=True, limits=True),
@@ -50,7 +61,7 @@ def suite_of(task: str) -> str | None:
 
 
 def protocol(suite: str, profile: str) -> dict[str, Any]:
-    """What benchmarks.toml says of a suite, as the profile has it; {} for one that the paper does not have."""
+    """What benchmarks.toml says of a suite, as the profile has it; {} for one that is not there."""
     entry = benchmarks().get(suite, {})
     changed = entry.get(profile, {})
     merged = {**entry, **changed, "env": {**entry.get("env", {}), **changed.get("env", {})}}
@@ -86,7 +97,8 @@ def _steps(found: Mapping[str, Any], name: str) -> int | None:
 
 
 def in_words(task: str, values: Mapping[str, Any]) -> str | None:
-    """A line that says how a run plays a task of a suite, and what the paper has instead; None without a protocol.
+    """A line that says how a run plays a task of a suite, and what the paper, or our protocol of a suite that it does
+    not have, has instead; None without a protocol.
 
     values: of the run, by the names of `settings`; keyword arguments of the environment and hyperparameters among them.
     """
@@ -95,11 +107,14 @@ def in_words(task: str, values: Mapping[str, Any]) -> str | None:
         return None
     rows = {name: paper[name] for name in RUN if name in paper} | paper["hyperparameters"] | paper["env_arg"]
     values = {**values, "size": _size(values)}
+    suite = suite_of(task)
+    assert suite is not None
+    whose = "paper" if of_the_paper(suite) else "protocol"
     words = (
-        f"{name} {show(values.get(name))}" + ("" if values.get(name) == value else f" (paper: {show(value)})")
+        f"{name} {show(values.get(name))}" + ("" if values.get(name) == value else f" ({whose}: {show(value)})")
         for name, value in rows.items()
     )
-    return f"protocol of {suite_of(task)}: {', '.join(words)}"
+    return f"protocol of {suite}: {', '.join(words)}"
 
 
 def _size(values: Mapping[str, Any]) -> str:
@@ -115,6 +130,11 @@ def show(value: Any) -> str:
     return f"{value:,}" if isinstance(value, int) else f"{value:g}" if isinstance(value, float) else str(value)
 
 
+def of_the_paper(suite: str) -> bool:
+    """Whether the paper has the suite; else what benchmarks.toml says of it is ours."""
+    return not benchmarks().get(suite, {}).get("ours", False)
+
+
 def tasks_of(suite: str) -> list[str]:
     """The tasks of a suite's protocol; [] for a suite that lists its own."""
     return list(benchmarks().get(suite, {}).get("tasks", []))
@@ -123,4 +143,4 @@ def tasks_of(suite: str) -> list[str]:
 def install(suite: str) -> str:
     """How to get what a suite needs: a command, or the page that says it."""
     extra = SUITES[suite].extra
-    return f"pip install 'dreamer-spec[{extra}]'" if extra else "see docs/suites.md"
+    return f"pip install 'dreamer-spec[{extra}]'" if extra else SUITES[suite].command or "see docs/suites.md"

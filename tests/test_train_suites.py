@@ -7,7 +7,7 @@ import pytest
 
 from dreamer_spec.cli import main, parse
 from dreamer_spec.options import Options
-from dreamer_spec.suites import SUITES, in_words, protocol, suite_of, tasks_of
+from dreamer_spec.suites import SUITES, in_words, of_the_paper, protocol, suite_of, tasks_of
 from spec import benchmarks, built_profiles, load_config
 
 WITH_BUDGET = [suite for suite, entry in benchmarks().items() if "steps" in entry]
@@ -48,6 +48,7 @@ def test_a_task_is_played_by_the_protocol_of_its_suite(suite: str, profile: str)
         ("bsuite", 23, None, 1, 1, 1024, "200m"),
         ("dmc", 18, 500_000, 2, 16, 512, "12m"),
         ("dmc_vision", 20, 1_000_000, 2, 16, 512, "12m"),
+        ("crafter", 1, 1_000_000, 1, 1, 512, "200m"),
     ],
 )
 def test_the_protocols_are_the_papers_table(
@@ -62,6 +63,18 @@ def test_control_from_vectors_lacks_the_two_quadruped_tasks() -> None:
     vision, vectors = (benchmarks()[suite]["tasks"] for suite in ("dmc_vision", "dmc"))
     assert [task for task in vision if task not in vectors] == ["quadruped-run", "quadruped-walk"]
     assert set(vectors) <= set(vision)
+
+
+def test_a_suite_that_the_paper_does_not_have_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+    assert [suite for suite in benchmarks() if not of_the_paper(suite)] == ["minigrid"]
+    assert protocol("minigrid", "paper") == protocol("minigrid", "official")
+    line = words(options("minigrid:MiniGrid-Empty-5x5-v0", "--steps", "1000"))
+    assert "steps 1,000 (protocol: 500,000)" in line
+    assert "paper" not in line
+    assert main(["tasks", "minigrid"]) == 0
+    shown = capsys.readouterr().out
+    assert "The paper does not have this suite" in shown
+    assert shown.splitlines()[-2:] == ["minigrid:BabyAI-OpenRedDoor-v0", "and every id that the package registers"]
 
 
 def test_presets_and_options_win_over_the_suite() -> None:
@@ -79,7 +92,7 @@ def test_presets_and_options_win_over_the_suite() -> None:
 
 def test_the_list_says_what_to_install(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     def find(name: str, *_: Any) -> Any:
-        return None if name == "crafter" else object()
+        return None if name in ("crafter", SUITES["procgen"].needs[0]) else object()
 
     monkeypatch.setattr(importlib.util, "find_spec", find)
     monkeypatch.setenv("COLUMNS", "160")
@@ -88,6 +101,9 @@ def test_the_list_says_what_to_install(capsys: pytest.CaptureFixture[str], monke
     assert set(SUITES) <= set(lines)
     assert "installed" in lines["atari"]
     assert "pip install 'dreamer-spec[crafter]'" in lines["crafter"]
+    assert "pip install --no-deps procgen-" in lines["procgen"]
+    assert "not in the paper" in lines["minigrid"]
+    assert "not in the paper" not in lines["crafter"]
     assert main(["tasks", "atari100k"]) == 0
     shown = capsys.readouterr().out
     assert "env.noops" in shown

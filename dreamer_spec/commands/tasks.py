@@ -11,13 +11,15 @@ from rich.table import Table
 from dreamer_spec.cli import Parser
 from dreamer_spec.errors import UserError
 from dreamer_spec.options import did_you_mean
-from dreamer_spec.suites import SUITES, install, protocol, show, tasks_of
+from dreamer_spec.suites import SUITES, install, of_the_paper, protocol, show, tasks_of
 from spec import benchmarks, built_profiles
 
 DESCRIPTION = """List the suites of tasks that `--task SUITE:NAME` names, or the protocol and the tasks of one.
 
   train tasks
   train tasks atari100k"""
+
+BESIDE = ("env", "tasks", "others", "ours")
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -47,7 +49,8 @@ def _suites() -> Table:
     for suite in SUITES:
         found, tasks = benchmarks().get(suite, {}), tasks_of(suite)
         budget = f"{found['steps']:,}" if "steps" in found else ""
-        view.add_row(suite, found.get("title", ""), str(len(tasks) or ""), budget, _installed(suite))
+        title = found.get("title", "") + ("" if of_the_paper(suite) else " (not in the paper)")
+        view.add_row(suite, title, str(len(tasks) or ""), budget, _installed(suite))
     return view
 
 
@@ -67,8 +70,12 @@ def _show(console: Console, suite: str) -> None:
         view.add_row(name, *(show(entry.get(name, "")) for entry in entries))
     console.print(view)
     console.print(f"{_installed(suite)}; `--env-arg NAME=VALUE` changes what begins with env.")
+    if not of_the_paper(suite):
+        console.print("The paper does not have this suite: the protocol is ours, whatever the profile.")
     for task in tasks_of(suite):
         console.print(f"{suite}:{task}{_configurations(suite, task)}")
+    if others := benchmarks().get(suite, {}).get("others"):
+        console.print(f"and {others}")
 
 
 def _configurations(suite: str, task: str) -> str:
@@ -78,8 +85,8 @@ def _configurations(suite: str, task: str) -> str:
 
 
 def _flat(found: dict[str, object]) -> dict[str, object]:
-    """{"env": {"noops": 0}} -> {"env.noops": 0}, without lists and tables."""
+    """{"env": {"noops": 0}} -> {"env.noops": 0}, without lists, tables and what is said beside the table."""
     arguments = found.get("env")
     assert arguments is None or isinstance(arguments, dict)
-    plain = {name: value for name, value in found.items() if not isinstance(value, dict | list)}
+    plain = {name: value for name, value in found.items() if name not in BESIDE and not isinstance(value, dict | list)}
     return plain | {f"env.{name}": value for name, value in (arguments or {}).items()}
