@@ -73,7 +73,7 @@ def test_products_of_many_rows_are_the_same(check: Check, monkeypatch: pytest.Mo
 @pytest.mark.parametrize("backend", ["jax", "torch"])
 def test_the_backend_offers_what_its_checks_use(backend: str) -> None:
     adapter = load_adapter(backend)
-    shared = {"Replay", "ReplayRatio", "train_step_with"}
+    shared = {"Replay", "ReplayRatio", "train_step_with", "run"}
     missing = {name for check in selected_checks("float64") for name in check.uses if not hasattr(adapter, name)}
     without_noise = {name for name in missing if name.endswith("_given") or name.startswith("draw_")}
     assert {name for name in missing - shared - without_noise if not _belongs_to_the_trainer(name)} == set()
