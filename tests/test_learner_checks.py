@@ -212,7 +212,7 @@ def test_mistakes_of_learners_are_found(check: str, kind: type[Learner]) -> None
 
 def test_a_learner_without_a_mode_is_not_judged_by_it() -> None:
     class WithoutMode(Learner):
-        def policy(self, observation: Any, is_first: np.ndarray, carry: Any, seed: int) -> Any:  # type: ignore[override]
+        def policy(self, observation: Any, is_first: Any, carry: Any, seed: int) -> Any:  # type: ignore[override]
             return super().policy(observation, is_first, carry, seed)
 
     check = CHECKS["learner.the_mode_takes_the_place_of_the_sample"]

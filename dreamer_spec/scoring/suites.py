@@ -8,17 +8,6 @@ import numpy as np
 
 from spec.paper_scores import PaperTable, paper_tables, references, windows
 
-# What stands before the colon of a task -> the suite of spec/paper_scores.py. The returns of BSuite are not its scores,
-# and the paper has no scores of Crafter: both are scored as any other task.
-NAMESPACES = {
-    "minecraft": "minecraft",
-    "atari": "atari",
-    "procgen": "procgen",
-    "dmlab": "dmlab",
-    "atari100k": "atari100k",
-    "dmc": "dmc",
-    "dmc_vision": "dmc_vision",
-}
 OTHER_WINDOW = 0.05  # the share of the budget, for tasks that the paper does not have
 
 
@@ -56,7 +45,8 @@ def _three(name: str, reference: str, capped: bool = False) -> tuple[Summary, ..
     return tuple(Summary(name.format(one), reference, capped, one) for one in ("mean", "median", "iqm"))
 
 
-# The first one of a suite says how a single task is normalized.
+# The first one of a suite says how a single task is normalized. The returns of BSuite are not its scores, and the paper
+# has no scores of Crafter: both are scored as any other task.
 SUMMARIES: Mapping[str, tuple[Summary, ...]] = {
     "minecraft": (),  # one task
     "atari": (
@@ -76,7 +66,7 @@ def split_task(task: str) -> tuple[str, str]:
     """dmc:walker-walk -> "dmc", "walker-walk". A task of no suite of the paper, or that its table lacks, is of
     the suite "", under its whole name."""
     namespace, _, name = task.partition(":")
-    suite = NAMESPACES.get(namespace, "")
+    suite = namespace if namespace in SUMMARIES else ""
     if suite == "dmlab" and name.endswith("_train"):  # trained on one set of levels, listed under the other: D-100
         name = name.removesuffix("_train") + "_test"
     return (suite, name) if suite and name in paper_tables()[suite].scores else ("", task)
