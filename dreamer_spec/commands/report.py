@@ -1,13 +1,12 @@
 """`train report`: one HTML page about one run or many."""
 
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
 from dreamer_spec.cli import Parser
-from dreamer_spec.disk.files import replacing, require_place
+from dreamer_spec.disk.files import require_place
 from dreamer_spec.errors import writing
-from dreamer_spec.report.page import render
+from dreamer_spec.report import page
 from dreamer_spec.report.runs import find_logdirs, read_run
 from dreamer_spec.words import counted
 
@@ -34,8 +33,6 @@ def main(arguments: Sequence[str]) -> int:
     with writing(options.out, remedy):
         require_place(options.out)
     runs = [read_run(logdir) for logdir in find_logdirs(options.logdirs)]
-    page = render(runs, time.time()).encode("utf-8", "replace")  # The name of a log directory need not be text.
-    with writing(options.out, remedy), replacing(options.out) as file:
-        file.write(page)
-    print(f"{options.out}: {counted(len(runs), 'run')}, {len(page) / 1000:,.0f} kB")
+    size = page.write(options.out, runs, remedy)
+    print(f"{options.out}: {counted(len(runs), 'run')}, {size / 1000:,.0f} kB")
     return 0

@@ -2,16 +2,14 @@
 
 import argparse
 import shlex
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
 
 from dreamer_spec.cli import Parser
-from dreamer_spec.disk.files import replacing
-from dreamer_spec.errors import UserError, writing
-from dreamer_spec.report.page import render
+from dreamer_spec.errors import UserError
+from dreamer_spec.report import page
 from dreamer_spec.report.runs import find_logdirs, read_run
 from dreamer_spec.sweeping.places import Processes, Ray
 from dreamer_spec.sweeping.plan import Plan, read_plan
@@ -62,8 +60,8 @@ def _run(plan: Plan, console: Console) -> int:
             f"{'interrupted' if code == INTERRUPTED else 'not all runs have ended'}; the same command continues",
             soft_wrap=True,
         )
-    if page := _report(plan, sweep.states):
-        console.print(f"{page}: {counted(len(plan.items), 'run')}", soft_wrap=True)
+    if path := _report(plan, sweep.states):
+        console.print(f"{path}: {counted(len(plan.items), 'run')}", soft_wrap=True)
     return code
 
 
@@ -74,12 +72,11 @@ def _last_words(log: Path) -> str:
 
 def _report(plan: Plan, states: list[State]) -> Path | None:
     """Writes the page about all runs; None where no run has anything to show."""
-    page = plan.logdir / "report.html"
+    path = plan.logdir / "report.html"
     logdirs = [state.item.options.logdir for state in states if state.item.options.logdir.exists()]
     try:
         runs = [read_run(logdir) for logdir in find_logdirs(logdirs)]
     except UserError:
         return None
-    with writing(page), replacing(page) as file:
-        file.write(render(runs, time.time()).encode("utf-8", "replace"))
-    return page
+    page.write(path, runs)
+    return path

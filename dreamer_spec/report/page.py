@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from conformance import pages
-from dreamer_spec.disk.files import Unreadable, open_file, reading
+from dreamer_spec.disk.files import Unreadable, open_file, reading, replacing
+from dreamer_spec.errors import writing
 from dreamer_spec.report.charts import Task, task_charts
 from dreamer_spec.report.results import headline, result_row
 from dreamer_spec.report.runs import RunLog, differing, group_runs, settings, show
@@ -15,6 +16,18 @@ from dreamer_spec.words import counted
 
 LARGEST_PICTURE = 8 * 2**20  # bytes of a picture that goes into the page
 KINDS = {b"\x89PNG\r\n\x1a\n": "image/png", b"GIF87a": "image/gif", b"GIF89a": "image/gif"}
+
+
+def write(path: Path, runs: Sequence[RunLog], remedy: str = "") -> int:
+    """Writes the page about these runs, whole or not at all. Returns its bytes.
+
+    Raises:
+      UserError: it cannot be written, with the remedy.
+    """
+    page = render(runs, time.time()).encode("utf-8", "replace")  # The name of a log directory need not be text.
+    with writing(path, remedy), replacing(path) as file:
+        file.write(page)
+    return len(page)
 
 
 def render(runs: Sequence[RunLog], now: float) -> str:
