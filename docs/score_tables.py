@@ -5,11 +5,9 @@ from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from dreamer_spec.scoring.suites import SUMMARIES
 from dreamer_spec.scoring.tables import of_paper
-from spec.paper_scores import PaperTable, bsuite_categories, paper_tables
+from spec.paper_scores import PaperTable, paper_tables
 
 CURVES = Path(__file__).resolve().parent / "results" / "paper-windows.json"
 
@@ -33,25 +31,9 @@ def summaries() -> tuple[list[str], list[list[str]]]:
 
 def _recomputed(table: PaperTable) -> dict[str, dict[str, float]]:
     """Summary -> column -> number."""
-    if table.suite == "bsuite":
-        return _of_bsuite(table)
     known = [summary for summary in SUMMARIES[table.suite] if table.aggregate(summary.name)]
     found = {summary.name: of_paper(summary, table, list(table.scores)) for summary in known}
     return {name: {column: value for column, value in row.items() if value is not None} for name, row in found.items()}
-
-
-def _of_bsuite(table: PaperTable) -> dict[str, dict[str, float]]:
-    """The means of BSuite in per cent: over experiments, and over categories."""
-    found: dict[str, dict[str, float]] = {"task_mean": {}, "category_mean": {}}
-    for method in table.methods:
-        scores = table.column(method.column)
-        categories: dict[str, list[float]] = {}
-        for task, names in bsuite_categories().items():
-            for name in names:
-                categories.setdefault(name, []).append(scores[task])
-        found["task_mean"][method.column] = 100 * float(np.mean(list(scores.values())))
-        found["category_mean"][method.column] = 100 * float(np.mean([np.mean(one) for one in categories.values()]))
-    return found
 
 
 def _is_printed(value: float, printed: Decimal | None) -> bool:

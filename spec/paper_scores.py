@@ -71,7 +71,8 @@ def paper_tables() -> dict[str, PaperTable]:
 @functools.cache
 def references() -> dict[str, dict[str, tuple[float, float]]]:
     """What counts as 0 and as 1, by task: `gamer` and `record` (Atari: random policy and game tester, random policy and
-    record), `human` (DMLab-30: random policy and human), `range` (ProcGen, hard).
+    record), `human` (DMLab-30: random policy and human), `range` (ProcGen, hard), `bsuite` (0 and 1: its scores are
+    normalized as they are).
 
     Records are those of the paper's table, whole numbers; all others are exact.
     """
@@ -82,6 +83,7 @@ def references() -> dict[str, dict[str, tuple[float, float]]]:
         "record": {task: (gamer[task][0], record) for task, record in records.items()},
         "human": _pairs("dmlab-references", "random", "human"),
         "range": _pairs("procgen-references", "minimum", "maximum"),
+        "bsuite": dict.fromkeys(paper_tables()["bsuite"].scores, (0.0, 1.0)),
     }
 
 

@@ -15,11 +15,12 @@ import numpy as np
 import pytest
 
 from dreamer_spec.cli import main, parse
-from dreamer_spec.commands.bsuite import LOGGED, is_logged, rows
+from dreamer_spec.commands.bsuite import rows
 from dreamer_spec.disk import about
 from dreamer_spec.envs import make_env, random_actions
 from dreamer_spec.envs.suites.bsuite import MNIST, BsuiteEnv, difference, reseed
 from dreamer_spec.errors import UserError
+from dreamer_spec.scoring.bsuite import LOGGED, is_logged
 from dreamer_spec.suites import protocol, settings, tasks_of
 from spec import Vector, benchmarks, built_profiles
 

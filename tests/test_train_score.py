@@ -131,7 +131,8 @@ def test_tasks_are_found_by_their_names() -> None:
     assert split_task("atari:pong") == ("atari", "pong")
     assert split_task("dmlab:rooms_collect_good_objects_train") == ("dmlab", "rooms_collect_good_objects_test")
     assert split_task("minecraft:diamond") == ("minecraft", "diamond")
-    for task in ("atari:adventure", "atari100k:zaxxon", "dmc:quadruped-run", "bsuite:catch/0", "crafter:reward"):
+    assert split_task("bsuite:catch") == split_task("bsuite:catch/3") == ("bsuite", "catch")
+    for task in ("atari:adventure", "atari100k:zaxxon", "dmc:quadruped-run", "bsuite:tennis/0", "crafter:reward"):
         assert split_task(task) == ("", task), "the paper has no score of it"
     for task in ("gym:CartPole-v1", "my_module:make_env", "atari", ""):
         assert split_task(task) == ("", task)
@@ -291,7 +292,7 @@ def test_runs_that_are_not_alike_are_said(tmp_path: Path, capsys: pytest.Capture
         "without any score: acrobot-swingup",
         f"no episode has ended: {folder / 'begun'}",
         f"unfinished, so that the window ends at the last step: {folder / 'begun'} (5 of 100), ",
-        "BSuite scores an experiment by its regret",
+        f"without what BSuite counts for its score; run with --info-metrics 'bsuite/*': {folder / 'catch'}",
     ):
         assert said in out, out
 

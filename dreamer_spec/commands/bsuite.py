@@ -1,14 +1,13 @@
 """`train bsuite LOGDIR... --csv FOLDER`: runs of BSuite as the package's own logger writes them.
 
-The scores of the benchmark are the package's (`summary_analysis.bsuite_score`), over all configurations of an
-experiment; most are made of what the package counts beside the rewards, such as regret without the noise, which the
-environments give and a run logs ([bsuite] in spec/benchmarks.toml). A logger inside the environments would lose count
-when a run is resumed, and count evaluations.
+For the package's own analysis and plots; `train score` has the same scores without it. They are made of what the
+package counts beside the rewards, such as regret without the noise, which the environments give and a run logs
+([bsuite] in spec/benchmarks.toml). A logger inside the environments would lose count when a run is resumed, and count
+evaluations.
 """
 
 import csv
 import io
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -18,15 +17,11 @@ from dreamer_spec.cli import Formatter, Parser
 from dreamer_spec.disk.files import replacing
 from dreamer_spec.errors import UserError, writing
 from dreamer_spec.report.runs import RunLog, find_logdirs, read_run
-from spec import benchmarks
+from dreamer_spec.scoring import bsuite
 
-DESCRIPTION = """Write runs of BSuite as the CSV files of the package bsuite, which scores them (docs/suites.md).
+DESCRIPTION = """Write runs of BSuite as the CSV files of the package bsuite, for its own analysis (docs/suites.md).
 
   train bsuite runs/bsuite-* --csv results"""
-
-# Of each decade, the episodes that the package logs.
-LOGGED = (1.0, 1.2, 1.4, 1.7, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0)
-INFO = "episode/info/bsuite/"
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -51,7 +46,8 @@ def main(arguments: Sequence[str]) -> int:
         written[name] = logdir
         rows = rows_of(run)
         _write(options.csv / f"bsuite_id_-_{name.replace('/', '-')}.csv", rows)
-        print(f"bsuite:{name}: {rows[-1]['episode']:,} of {episodes_of(name):,} episodes, from {logdir}")
+        most = bsuite.episodes_of(name.partition("/")[0])
+        print(f"bsuite:{name}: {rows[-1]['episode']:,} of {most:,} episodes, from {logdir}")
     return 0
 
 
@@ -61,17 +57,10 @@ def configuration(run: RunLog) -> str:
     Raises:
       UserError: a run of something else.
     """
-    suite, _, name = run.task.partition(":")
-    experiment, separator, _ = name.partition("/")
-    if suite != "bsuite" or experiment not in benchmarks()["bsuite"]["experiments"]:
+    found = bsuite.configuration(run.task)
+    if found is None:
         raise UserError(f"{run.logdir} is a run of {run.task or 'an unknown task'}; expected bsuite:EXPERIMENT/NUMBER")
-    return name if separator else f"{name}/0"
-
-
-def episodes_of(name: str) -> int:
-    """Episodes that a score of the experiment is made of."""
-    count: int = benchmarks()["bsuite"]["experiments"][name.partition("/")[0]]["episodes"]
-    return count
+    return f"{found[0]}/{found[1]}"
 
 
 def rows_of(run: RunLog) -> list[dict[str, float]]:
@@ -83,16 +72,13 @@ def rows_of(run: RunLog) -> list[dict[str, float]]:
     if "episode/return" not in run.curves:
         raise UserError(f"{run.logdir}: no episode has ended")
     returns, lengths = run.curves["episode/return"].values, run.curves["episode/length"].values
-    counted = {
-        key.removeprefix(INFO): curve.values
-        for key, curve in run.curves.items()
-        if key.startswith(INFO) and len(curve.values) == len(returns)
-    }
+    counted = bsuite.counted_by_the_package(run)
     name = configuration(run)
-    best = name.startswith("cartpole")
-    if ("raw_return" not in counted) if best else not (counted or name.startswith("discounting_chain")):
+    experiment = name.partition("/")[0]
+    best = experiment.startswith("cartpole")
+    if bsuite.needed(experiment) not in {*counted, ""} or (best and "raw_return" not in counted):
         raise UserError(f"{run.logdir} did not log what the package counts; run with --info-metrics 'bsuite/*'")
-    return rows(returns, lengths - 1, counted, best, episodes_of(name))
+    return rows(returns, lengths - 1, counted, best, bsuite.episodes_of(experiment))
 
 
 def rows(
@@ -107,18 +93,12 @@ def rows(
     sums |= {name: np.cumsum(values) for name, values in counted.items()}
     if best:
         sums["best_episode"] = np.maximum.accumulate(counted["raw_return"])
-    chosen = [episode for episode in range(1, min(len(returns), most) + 1) if is_logged(episode)]
+    chosen = [episode for episode in range(1, min(len(returns), most) + 1) if bsuite.is_logged(episode)]
     return [
         {"episode": episode, "episode_return": float(returns[episode - 1]), "episode_len": float(lengths[episode - 1])}
         | {name: float(values[episode - 1]) for name, values in sums.items()}
         for episode in chosen
     ]
-
-
-def is_logged(episode: int) -> bool:
-    """Whether the package logs this episode, counted from 1."""
-    decade = 10 ** math.floor(math.log10(episode))
-    return any(episode == decade * part for part in LOGGED)
 
 
 def _write(path: Path, rows: Sequence[Mapping[str, float]]) -> None:

@@ -61,9 +61,10 @@ def summary_cells(suite: SuiteScore) -> Cells:
 def _summary(found: SummaryScore, suite: SuiteScore) -> list[str]:
     unit = f" {found.summary.unit}".rstrip()
     interval = found.estimate.interval
-    between = f"{interval[0]:,.1f} to {interval[1]:,.1f}" if interval else "one run a task"
+    digits = 2 if found.summary.category else 1  # scores between 0 and 1
+    between = f"{interval[0]:,.{digits}f} to {interval[1]:,.{digits}f}" if interval else "one run a task"
     name = found.summary.name.replace("_", " ").replace("iqm", "interquartile mean")
-    return [name, f"{found.estimate.value:,.1f}{unit}", between, *_paper(found.paper, suite, unit)]
+    return [name, f"{found.estimate.value:,.{digits}f}{unit}", between, *_paper(found.paper, suite, unit)]
 
 
 def origin(suite: SuiteScore) -> str:

@@ -100,7 +100,7 @@ def _suite_json(suite: SuiteScore) -> dict[str, Any]:
                 "score": task.score,
                 "standard_deviation": task.deviation,
                 "normalized_percent": task.normalized,
-                "runs": [run.score for run in task.runs],
+                "runs": task.values.tolist(),
                 "paper": task.paper,
             }
             for task in suite.tasks

@@ -26,13 +26,13 @@ def draw(scores: Sequence[RunScore], protocol: Protocol, path: Path) -> None:
     Raises:
       UserError: the disk refuses it.
     """
-    tasks = list(dict.fromkeys((score.suite, score.task) for score in scores))
+    tasks = list(dict.fromkeys((score.suite, score.task, score.run.task) for score in scores))
     columns = min(COLUMNS, len(tasks))
     rows = math.ceil(len(tasks) / columns)
     figure = Figure(figsize=(3.2 * columns + 0.4, 2.4 * rows + 0.4), dpi=150, layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False)
-    for axes, (suite, task) in zip(grid.flat, tasks, strict=False):
-        runs = [score.run for score in scores if (score.suite, score.task) == (suite, task)]
+    for axes, (suite, task, full) in zip(grid.flat, tasks, strict=False):
+        runs = [score.run for score in scores if score.run.task == full]
         _draw_task(axes, suite, task, runs, EPISODES[protocol.episodes])
     for axes in grid.flat[len(tasks) :]:
         axes.set_axis_off()
@@ -41,11 +41,12 @@ def draw(scores: Sequence[RunScore], protocol: Protocol, path: Path) -> None:
 
 
 def _draw_task(axes: Axes, suite: str, task: str, runs: Sequence[RunLog], metric: str) -> None:
+    """Dreamer's score in the paper is a line but in BSuite, whose scores are no returns."""
     end = max(max(run.step, run.planned or 0) for run in runs)
     steps, mean, deviation = mean_curve([run.curves[metric] for run in runs if metric in run.curves], end)
     axes.plot(steps, mean, color=BLUE, linewidth=1.5)
     axes.fill_between(steps, mean - deviation, mean + deviation, color=BLUE, alpha=0.2, linewidth=0)
-    if suite and (score := paper_tables()[suite].scores[task]["dreamer"]) is not None:
+    if suite not in ("", "bsuite") and (score := paper_tables()[suite].scores[task]["dreamer"]) is not None:
         axes.axhline(float(score), color=GRAY, linestyle="--", linewidth=1)
     axes.set_title(runs[0].task, fontsize=9)
     axes.set_xlim(0, max(end, 1))

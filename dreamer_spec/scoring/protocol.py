@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 
 from dreamer_spec.report.runs import RunLog
+from dreamer_spec.scoring import bsuite
 from dreamer_spec.scoring.suites import split_task, window_of
 
 EPISODES = {"training": "episode/return", "evaluation": "evaluation/return"}
@@ -34,8 +35,9 @@ class Note:
 class RunScore:
     """What came of one run.
 
-    suite, task: as `split_task` names them. score: None if no episode ended. returns: how many numbers it is the mean
-    of, episodes or evaluations. first, last: the window, in environment steps.
+    suite, task: as `split_task` names them. score: None if no episode ended; of BSuite that of this configuration
+    alone. returns: how many numbers it is made of, episodes or evaluations. first, last: the window, in environment
+    steps.
     """
 
     run: RunLog
@@ -51,6 +53,8 @@ class RunScore:
 def score_run(run: RunLog, protocol: Protocol) -> RunScore:
     """The score of a run. Of one that has not reached its budget the window ends where it is."""
     suite, task = split_task(run.task)
+    if suite == "bsuite":
+        return _score_bsuite(run, task)
     notes = [Note(note) for note in run.notes]
     budget = run.planned
     if budget is None:
@@ -73,6 +77,22 @@ def score_run(run: RunLog, protocol: Protocol) -> RunScore:
         notes.append(Note(f"no {'episode has ended' if protocol.episodes == 'training' else 'evaluation was made'}"))
     score = float(np.mean(values[inside])) if inside.any() else None
     return RunScore(run, suite, task, score, int(inside.sum()), max(first, 0.0), end, tuple(notes))
+
+
+def _score_bsuite(run: RunLog, experiment: str) -> RunScore:
+    """By the first episodes of training, whatever the protocol: BSuite scores how soon something is learned."""
+    notes = [Note(note) for note in run.notes]
+    episodes, most = bsuite.scored(run), bsuite.episodes_of(experiment)
+    if episodes is None and "episode/return" in run.curves:
+        notes.append(Note("without what BSuite counts for its score; run with --info-metrics 'bsuite/*'"))
+    elif episodes is None:
+        notes.append(Note("no episode has ended"))
+    elif len(episodes.returns) < most:
+        notes.append(Note("fewer episodes than BSuite's score is made of", f"{len(episodes.returns):,} of {most:,}"))
+    score = None if episodes is None else bsuite.score(experiment, [episodes])
+    returns = 0 if episodes is None else len(episodes.returns)
+    last = float(run.curves["episode/return"].steps[returns - 1]) if returns else 0.0
+    return RunScore(run, "bsuite", experiment, score, returns, 0.0, last, tuple(notes))
 
 
 def _last_round(run: RunLog) -> int:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from dreamer_spec.report.runs import RunLog, show
-from dreamer_spec.scoring import statistics
+from dreamer_spec.scoring import bsuite, statistics
 from dreamer_spec.scoring.protocol import Protocol, RunScore
 from dreamer_spec.system.machine import own_version
 from dreamer_spec.words import counted
@@ -44,6 +44,8 @@ def _protocol(protocol: Protocol) -> str:
 
 
 def _window(score: RunScore, protocol: Protocol) -> str:
+    if score.suite == "bsuite":
+        return f"bsuite: the first {bsuite.episodes_of(score.task):,} training episodes, scored by bsuite's own rules"
     budget = f" of {score.run.planned:,} environment steps" if score.run.planned else ""
     return f"{score.suite or 'other tasks'}: the last {100 * protocol.share(score.suite):g} %{budget}"
 

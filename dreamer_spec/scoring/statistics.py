@@ -8,7 +8,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from dreamer_spec.scoring.suites import Summary
+from dreamer_spec.scoring.suites import CATEGORIES, Summary
+from spec.paper_scores import bsuite_categories
 
 LEVEL = 0.95
 RESAMPLES = 10_000
@@ -35,11 +36,22 @@ def estimate(summary: Summary, tasks: Sequence[str], scores: Scores) -> Estimate
 
 def summarize(summary: Summary, tasks: Sequence[str], scores: Scores) -> np.ndarray:
     """[...]: mean and median are over tasks, of the normalized mean of each task's runs, as in the paper (D-118); the
-    interquartile mean is over all runs."""
+    interquartile mean is over all runs. At least one task must count for the summary."""
+    counting = [index for index, task in enumerate(tasks) if summary.counts(task)]
+    tasks, scores = [tasks[index] for index in counting], [scores[index] for index in counting]
     if summary.statistic == "iqm":
         return interquartile_mean(summary.normalized(tasks, scores))
     of_tasks = np.stack(summary.normalized(tasks, [np.mean(runs, axis=-1) for runs in scores]), axis=-1)
+    if summary.statistic == "category_mean":
+        return category_mean(tasks, of_tasks)
     return np.mean(of_tasks, axis=-1) if summary.statistic == "mean" else np.median(of_tasks, axis=-1)
+
+
+def category_mean(tasks: Sequence[str], values: np.ndarray) -> np.ndarray:
+    """The mean over BSuite's categories of the mean of the experiments in each, those without any left out:
+    [..., tasks] -> [...]."""
+    members = [[name in bsuite_categories()[task] for task in tasks] for name in CATEGORIES]
+    return np.mean([np.mean(values[..., inside], axis=-1) for inside in members if any(inside)], axis=0)
 
 
 def interquartile_mean(scores: Scores) -> np.ndarray:

@@ -1,5 +1,6 @@
 """The scores of many runs by suite: a row for each task, summaries of them, and the paper's numbers for the same."""
 
+import collections
 import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -7,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from dreamer_spec.report.runs import LABELS, RunLog, differing, settings, show
+from dreamer_spec.scoring import bsuite
 from dreamer_spec.scoring.protocol import RunScore
 from dreamer_spec.scoring.statistics import Estimate, estimate, summarize
 from dreamer_spec.scoring.suites import SUMMARIES, Summary, tasks_of
@@ -18,11 +20,13 @@ Paper = dict[str, float | None]  # column of the paper's table -> number, None f
 
 @dataclasses.dataclass(frozen=True)
 class TaskScore:
-    """Of one task. runs: those that have a score. deviation: the standard deviation over runs (n - 1), None for a
-    single one. normalized: in per cent, None if the suite is not normalized."""
+    """Of one task. runs: those that have a score. values: their scores; of BSuite a score for each seed, made of all
+    configurations with it. deviation: the standard deviation of these (n - 1), None for a single one. normalized: in
+    per cent, None if the suite is not normalized."""
 
     task: str
     runs: tuple[RunScore, ...]
+    values: np.ndarray
     score: float
     deviation: float | None
     normalized: float | None
@@ -71,8 +75,10 @@ def _suite(suite: str, scores: Sequence[RunScore]) -> SuiteScore:
     first = SUMMARIES[suite][0] if SUMMARIES[suite] and SUMMARIES[suite][0].reference else None
     tasks = tuple(_task(name, scores, first, _floats(table.scores[name])) for name in names)
     complete = len(names) == len(table.scores)
-    summaries = tuple(_summary(summary, table, tasks, complete) for summary in SUMMARIES[suite]) if tasks else ()
+    counting = [summary for summary in SUMMARIES[suite] if any(map(summary.counts, names))]
+    summaries = tuple(_summary(summary, table, tasks, complete) for summary in counting)
     notes = [*_differences([score.run for score in scores]), *_against_the_paper(suite, scores), *_single(tasks)]
+    notes += _configurations(tasks) if suite == "bsuite" else []
     return SuiteScore(suite, len(table.scores), table.methods, tasks, summaries, tuple(notes))
 
 
@@ -83,27 +89,47 @@ def _others(scores: Sequence[RunScore]) -> SuiteScore:
     for name in names:
         runs = [score.run for score in scores if score.task == name]
         notes += [f"{name}: {note}" for note in _differences(runs)]
-    if any(name.startswith("bsuite:") for name in names):
-        notes.append("BSuite scores an experiment by its regret, which returns do not tell: these are plain returns")
     return SuiteScore("", len(names), (), tuple(_task(name, scores, None, {}) for name in found), (), tuple(notes))
 
 
 def _task(name: str, scores: Sequence[RunScore], summary: Summary | None, paper: Paper) -> TaskScore:
     runs = tuple(score for score in scores if score.task == name and score.score is not None)
-    values = _values(runs)
+    values = _of_bsuite(name, runs) if runs[0].suite == "bsuite" else np.array([run.score for run in runs], float)
     mean = np.mean(values)
     normalized = float(summary.normalized([name], [mean])[0]) if summary else None
     deviation = float(np.std(values, ddof=1)) if len(values) > 1 else None
-    return TaskScore(name, runs, float(mean), deviation, normalized, paper)
+    return TaskScore(name, runs, values, float(mean), deviation, normalized, paper)
 
 
-def _values(runs: Sequence[RunScore]) -> np.ndarray:
-    return np.array([run.score for run in runs], float)
+def _of_bsuite(experiment: str, runs: Sequence[RunScore]) -> np.ndarray:
+    """[n]: the score of each seed, made of all configurations that were run with it. Another run of the same
+    configuration and seed begins a score of its own."""
+    together: dict[tuple[str, int], list[bsuite.Episodes]] = {}
+    seen: collections.Counter[tuple[str, int]] = collections.Counter()
+    for run in runs:
+        episodes = bsuite.scored(run.run)
+        assert episodes is not None, "it has a score"
+        seed = show(run.run.seed)
+        together.setdefault((seed, seen[seed, episodes.number]), []).append(episodes)
+        seen[seed, episodes.number] += 1
+    return np.array([bsuite.score(experiment, episodes) for episodes in together.values()])
+
+
+def _configurations(tasks: Sequence[TaskScore]) -> list[str]:
+    """Experiments of which not all configurations were run."""
+    known = benchmarks()["bsuite"]["experiments"]
+    found = {task.task: len({bsuite.configuration(run.run.task) for run in task.runs}) for task in tasks}
+    partly = [
+        f"{name} {count} of {known[name]['configurations']}"
+        for name, count in found.items()
+        if count < known[name]["configurations"]
+    ]
+    return [f"not all configurations were run: {', '.join(partly)}"] if partly else []
 
 
 def _summary(summary: Summary, table: PaperTable, tasks: Sequence[TaskScore], complete: bool) -> SummaryScore:
     names = [task.task for task in tasks]
-    found = estimate(summary, names, [_values(task.runs) for task in tasks])
+    found = estimate(summary, names, [task.values for task in tasks])
     if summary.statistic == "iqm":
         return SummaryScore(summary, found, {})
     printed = table.aggregate(summary.name) if complete else None
@@ -151,8 +177,8 @@ def _single(tasks: Sequence[TaskScore]) -> list[str]:
 
 def _against_the_paper(suite: str, scores: Sequence[RunScore]) -> list[str]:
     """Another budget than the paper's, and runs without a score."""
-    paper = benchmarks()[suite]["steps"]
-    budgets = sorted({score.run.planned for score in scores if score.run.planned} - {paper})
+    paper = benchmarks()[suite].get("steps")  # none for BSuite, whose budget is in episodes
+    budgets = sorted({score.run.planned for score in scores if score.run.planned} - {paper}) if paper else []
     notes = [f"the paper's budget is {paper:,} environment steps, here it is {budget:,}" for budget in budgets]
     without = sorted({score.task for score in scores} - {score.task for score in scores if score.score is not None})
     return notes + ([f"without any score: {', '.join(without)}"] if without else [])
