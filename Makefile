@@ -9,7 +9,7 @@ RANGES ?= jax,dm-control,test
 RANGE_TESTS ?= $(addprefix tests/test_,$(addsuffix .py,learners reference_agent reference_replay reports skeleton spec train_cli train_envs \
 	train_logger train_loop train_replay train_report)) -k 'not torch and not in_the_other'
 
-.PHONY: train test test-slow test-lowest test-newest bench docs lint lock clean
+.PHONY: train test test-slow test-lowest test-newest test-suites bench docs lint lock clean
 
 train: .venv/.installed
 	$(RUN)/train --backend $(BACKEND)
@@ -37,6 +37,14 @@ test-newest: .venv-newest/.tested
 	$(UV) pip freeze --quiet --python $(@D) --exclude-editable
 	$(@D)/bin/pytest -n 2 --dist loadgroup $(RANGE_TESTS)
 	$(@D)/bin/train --backend $(BACKEND) --steps 2000 --logdir $(@D)/run --resume never
+
+# The suites with their packages, those too that the lock cannot hold: sources to be built, and ProcGen, which asks for an older NumPy.
+PROCGEN := $(shell $(PYTHON) -c 'import sys; print("procgen-mirror==0.10.7 gym3==0.3.3 cffi pycparser" if sys.version_info < (3, 13) else "procgen-gym==0.1.1")')
+test-suites: $(UV)
+	$(UV) venv --quiet --clear --python $(PYTHON) .venv-suites
+	$(UV) pip install --quiet --python .venv-suites --override requirements/overrides.txt -e '.[jax,dm-control,atari,bsuite,crafter,minigrid,test]'
+	$(UV) pip install --quiet --python .venv-suites --no-deps $(PROCGEN)
+	.venv-suites/bin/pytest -n 2 --dist loadgroup -rs tests/test_bsuite_scores.py $(foreach suite,atari bsuite crafter dm minigrid procgen suites,$(wildcard tests/test_train_$(suite)*.py))
 
 bench: .venv/.installed
 	$(RUN)/python -m benchmarks.train_step
@@ -71,4 +79,4 @@ $(UV):
 	.venv-uv/bin/python -m pip install --quiet --disable-pip-version-check 'uv>=0.9'
 
 clean:
-	rm -rf .venv .venv-uv .venv-lowest .venv-newest
+	rm -rf .venv .venv-uv .venv-lowest .venv-newest .venv-suites

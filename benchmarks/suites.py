@@ -60,7 +60,8 @@ def row(what: str, envs: int, wall: float, cpu: float | None, resets: list[float
     return f"| {what} | {envs} | {wall:,.0f} | {'' if cpu is None else f'{cpu:,.0f}'} | {reset} |"
 
 
-# The packages alone: the name of a task and a number of environments -> one step of all of them, with random actions
+# The packages alone: the name of a task and a number of environments -> one step of all of them, with random actions.
+# A step of dm_control is two of the package's, as the protocol repeats actions.
 
 
 def ale(game: str, envs: int) -> Step:
@@ -69,7 +70,18 @@ def ale(game: str, envs: int) -> Step:
     from ale_py.env import AtariEnv
 
     ale_py.ALEInterface.setLoggerMode(ale_py.LoggerMode.Error)
-    env = AtariEnv(game, frameskip=4, full_action_space=True)
+    return of_gymnasium(AtariEnv(game, frameskip=4, full_action_space=True))
+
+
+def minigrid(name: str, envs: int) -> Step:
+    """Its own picture of what the agent sees, 56 x 56."""
+    import gymnasium
+    from minigrid.wrappers import RGBImgPartialObsWrapper
+
+    return of_gymnasium(RGBImgPartialObsWrapper(gymnasium.make(name)))
+
+
+def of_gymnasium(env: Any) -> Step:
     env.reset(seed=0)
 
     def step() -> None:
@@ -77,6 +89,46 @@ def ale(game: str, envs: int) -> Step:
             env.reset()
 
     return step
+
+
+def crafter(name: str, envs: int) -> Step:
+    import crafter as package
+
+    env, rng = package.Env(), np.random.default_rng(0)
+    env.reset()
+
+    def step() -> None:
+        if env.step(rng.integers(env.action_space.n))[2]:
+            env.reset()
+
+    return step
+
+
+def bsuite(name: str, envs: int) -> Step:
+    import bsuite as package
+
+    env, rng = package.load_from_id(name if "/" in name else f"{name}/0"), np.random.default_rng(0)
+    env.reset()
+    return lambda: env.step(rng.integers(env.action_spec().num_values))  # It resets by itself.
+
+
+def dmc(name: str, envs: int) -> Step:
+    _, advance = of_dm_control(name)
+    return lambda: (advance(), advance())
+
+
+def dmc_vision(name: str, envs: int) -> Step:
+    env, advance = of_dm_control(name)
+    return lambda: (advance(), advance(), env.physics.render(64, 64, camera_id=0))
+
+
+def of_dm_control(name: str) -> tuple[Any, Step]:
+    from dm_control import suite
+
+    env, rng = suite.load(*name.split("-")), np.random.default_rng(0)
+    spec = env.action_spec()
+    env.reset()
+    return env, lambda: env.step(rng.uniform(spec.minimum, spec.maximum))  # It resets by itself.
 
 
 def ale_vector(game: str, envs: int) -> Step:
@@ -101,9 +153,14 @@ def ale_vector(game: str, envs: int) -> Step:
 
 
 BARE: Mapping[str, Mapping[str, Callable[[str, int], Step]]] = {
-    suite: {"ale_py.env.AtariEnv": ale, "ale_py.AtariVectorEnv": ale_vector} for suite in ("atari", "atari100k")
+    **{suite: {"ale_py.env.AtariEnv": ale, "ale_py.AtariVectorEnv": ale_vector} for suite in ("atari", "atari100k")},
+    "bsuite": {"bsuite": bsuite},
+    "crafter": {"crafter.Env": crafter},
+    "minigrid": {"minigrid": minigrid},
+    "dmc": {"dm_control": dmc},
+    "dmc_vision": {"dm_control": dmc_vision},
 }
-ONE = (ale,)  # those that are one environment
+VECTORS = (ale_vector,)  # those that are several environments
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -123,7 +180,7 @@ def main(arguments: list[str] | None = None) -> int:
         for envs in options.envs:
             print(measure(f"{options.suite}:{name}", envs, options.seconds), flush=True)
             for label, bare in BARE.get(options.suite, {}).items():
-                if envs == 1 or bare not in ONE:
+                if envs == 1 or bare in VECTORS:
                     wall, cpu = rates(bare(name, envs), envs, options.seconds)
                     print(row(f"{label}, alone", envs, wall, cpu, []), flush=True)
     except UserError as error:

@@ -16,7 +16,8 @@ import pytest
 from dreamer_spec.cli import parse
 from dreamer_spec.envs import make_env
 from dreamer_spec.envs.suites import Play
-from dreamer_spec.envs.suites.dmlab import bucket, encode, level_of, make, reads, tokens
+from dreamer_spec.envs.suites.dmlab import level_of, make, reads
+from dreamer_spec.envs.suites.text import bucket, encode, tokens
 from dreamer_spec.errors import UserError
 from dreamer_spec.suites import protocol, tasks_of
 from spec import Image, Vector, benchmarks
@@ -103,18 +104,18 @@ def chosen(number: int) -> np.ndarray:
 
 
 def test_tokens_are_words_and_what_stands_between_them_and_spaces() -> None:
-    assert tokens("Pick the RED_ball, 2 x!?") == ["pick", "the", "red_ball", ",", "2", "x", "!?"]
-    assert tokens("  ") == tokens("") == []
-    assert tokens("a\tb\nc  3é") == ["a", "\t", "b", "\n", "c", "3é"]
+    assert tokens("dmlab", "Pick the RED_ball, 2 x!?") == ["pick", "the", "red_ball", ",", "2", "x", "!?"]
+    assert tokens("dmlab", "  ") == tokens("dmlab", "") == []
+    assert tokens("dmlab", "a\tb\nc  3é") == ["a", "\t", "b", "\n", "c", "3é"]
 
 
 def test_the_encoding_by_hand() -> None:
     """The first numbers of NumPy's default generator with seed 0, and the published check value of CRC-32."""
     assert zlib.crc32(b"123456789") == 0xCBF43926
-    assert bucket("123456789") == 0xCBF43926 % 65_536 == 0x3926
+    assert bucket("dmlab", "123456789") == 0xCBF43926 % 65_536 == 0x3926
     table = np.random.default_rng(0).normal(0.0, 1.0, (65_536, 32)).astype(np.float32)
     assert table[0, 0] == np.float32(0.1257302210933933)
-    found = encode("123456789 Red").reshape(32, 32)
+    found = encode("dmlab", "123456789 Red").reshape(32, 32)
     assert found.dtype == np.float32
     np.testing.assert_array_equal(found[0], table[0x3926])
     np.testing.assert_array_equal(found[1], table[zlib.crc32(b"red") & 0xFFFF])
@@ -123,9 +124,9 @@ def test_the_encoding_by_hand() -> None:
 
 def test_what_is_over_the_slots_is_dropped() -> None:
     words = " ".join(f"word{'a' * number}" for number in range(40))
-    np.testing.assert_array_equal(encode(words), encode(" ".join(words.split()[:32])))
-    assert (encode(words) != encode(" ".join(words.split()[:31]))).any()
-    assert encode(words).shape == encode("").shape == (1024,)
+    np.testing.assert_array_equal(encode("dmlab", words), encode("dmlab", " ".join(words.split()[:32])))
+    assert (encode("dmlab", words) != encode("dmlab", " ".join(words.split()[:31]))).any()
+    assert encode("dmlab", words).shape == encode("dmlab", "").shape == (1024,)
 
 
 # The protocol
@@ -207,7 +208,7 @@ def test_the_last_observation_is_repeated_at_the_end(engine: list[Lab], terminal
         assert rewards == [4, 4, 4, 4, 4, 1]
         assert ends == [(False, False)] * 5 + [(terminal, not terminal)]
         assert [int(record["image"][1, 1, 0]) for record in records] == [0, 4, 8, 12, 16, 20, 20]
-        np.testing.assert_array_equal(records[-2]["instruction"], encode("Pick the red ball 20"))
+        np.testing.assert_array_equal(records[-2]["instruction"], encode("dmlab", "Pick the red ball 20"))
         np.testing.assert_array_equal(records[-1]["instruction"], records[-2]["instruction"])
 
 

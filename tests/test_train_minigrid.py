@@ -12,11 +12,12 @@ from dreamer_spec.envs import make_env
 from dreamer_spec.envs.adapter import ContractEnv
 from dreamer_spec.errors import UserError
 from dreamer_spec.suites import protocol, tasks_of
-from spec import Discrete, Image
+from spec import Discrete, Image, Vector
 
 pytest.importorskip("minigrid", reason="MiniGrid is not installed: pip install 'dreamer-spec[minigrid]'")
 
 from dreamer_spec.envs.suites.minigrid import MiniGridEnv
+from dreamer_spec.envs.suites.text import encode, tokens
 
 EMPTY = "MiniGrid-Empty-5x5-v0"
 LEFT, FORWARD = 0, 2
@@ -109,17 +110,24 @@ def test_seeds_reproduce_the_episodes_of_every_id() -> None:
         np.testing.assert_equal(first, played(made(name), 1, 12))
         differ += any((a[0]["image"] != b[0]["image"]).any() for a, b in zip(first, played(env, 2, 12), strict=False))
     assert differ > 150
-    with pytest.raises(UserError, match=r"a file of the package minigrid is missing: .*png"):
+    with pytest.raises(UserError, match=r"a file of the package minigrid is missing: .*png|imageio is missing"):
         made("MiniGrid-WFC-MazeSimple-v0")
 
 
-@pytest.mark.parametrize("name", tasks_of("minigrid"))
-def test_the_tasks_of_the_protocol_need_no_mission(name: str) -> None:
-    """It is text, which is left out: where it changes, the goal could not be known."""
+@pytest.mark.parametrize("name", [*tasks_of("minigrid"), "MiniGrid-Fetch-5x5-N2-v0", "BabyAI-BossLevel-v0"])
+def test_the_mission_is_told_where_it_changes(name: str) -> None:
     assert name in known()
     env = made(name)
-    missions = {env._env.reset(seed=seed)[1]["mission"] for seed in range(20)}
-    assert len({mission.replace("the", "a") for mission in missions}) == 1  # "go to a red ball"
+    episodes = [env._env.reset(seed=seed) for seed in range(20)]
+    missions = [info["mission"] for _, info in episodes]
+    if "mission" not in env.spaces.observations:
+        assert len(set(missions)) == 1
+        return
+    assert env.spaces.observations["mission"] == Vector(2048)
+    assert max(len(tokens("minigrid", mission)) for mission in missions) <= 64
+    for seen, mission in zip(episodes, missions, strict=True):
+        np.testing.assert_array_equal(seen[0]["mission"], encode("minigrid", mission))
+    assert len({seen[0]["mission"].tobytes() for seen in episodes}) == len(set(missions))
 
 
 def test_ids_that_came_from_another_process_are_no_news() -> None:

@@ -127,9 +127,9 @@ def _print(console: Console, suites: Sequence[SuiteScore], scores: Sequence[RunS
 
 
 def _table(found: cells.Cells) -> Table:
-    table = Table(box=box.SIMPLE_HEAD, show_edge=False)
+    table = Table(box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 0, 0, 1), pad_edge=False)  # 80 columns are narrow
     for number, column in enumerate(found.header):
-        table.add_column(column, justify="right" if number else "left", overflow="fold")
+        table.add_column(column, justify="right" if number else "left", overflow="fold", no_wrap=not number)
     for row in found.rows:
         table.add_row(*row)
     return table

@@ -21,7 +21,7 @@ def statement(scores: Sequence[RunScore], protocol: Protocol, command: str) -> S
     """By topic, in words. command: that of the scores themselves."""
     runs = [score.run for score in scores]
     return {
-        "protocol": _protocol(protocol),
+        "protocol": _distinct(_protocol(score, protocol) for score in scores),
         "window": _distinct(_window(score, protocol) for score in scores),
         "episodes": _episodes(scores, protocol),
         "seeds": _seeds(runs),
@@ -35,7 +35,9 @@ def statement(scores: Sequence[RunScore], protocol: Protocol, command: str) -> S
     }
 
 
-def _protocol(protocol: Protocol) -> str:
+def _protocol(score: RunScore, protocol: Protocol) -> str:
+    if score.suite == "bsuite":
+        return "BSuite's score of each experiment and seed; then the mean over seeds, then over tasks (docs/scores.md)"
     what = "training episodes that ended" if protocol.episodes == "training" else "evaluations that were made"
     return (
         f"mean return of the {what} in the window; then the mean over seeds, then normalization, then summaries over "

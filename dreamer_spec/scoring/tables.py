@@ -154,8 +154,9 @@ def _floats(row: Mapping[str, Any]) -> Paper:
 
 def _differences(runs: Sequence[RunLog]) -> list[str]:
     """In what runs that are taken together differ, and seeds that are there more than once."""
+    budget = [] if all(bsuite.configuration(run.task) for run in runs) else ["steps"]  # in BSuite each task's own
     shown = [
-        {name: value for name, value in settings(run).items() if name in (*LABELS, "steps", *run.hyperparameters)}
+        {name: value for name, value in settings(run).items() if name in (*LABELS, *budget, *run.hyperparameters)}
         for run in runs
     ]
     notes = []

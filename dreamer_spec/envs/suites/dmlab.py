@@ -4,18 +4,14 @@ The engine, `deepmind_lab`, has to be built from its source (docs/suites.md). Wh
 Python interface: `Lab(level, observations, config, renderer)` with `reset`, `step`, `is_running`, `observations`.
 """
 
-import functools
 import importlib
-import re
-import zlib
-from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces as gym
 
-from dreamer_spec.envs.suites import Play
+from dreamer_spec.envs.suites import Play, text
 from dreamer_spec.errors import UserError
 from spec import benchmarks
 
@@ -70,8 +66,7 @@ class DmLabEnv(gymnasium.Env[Any, Any]):
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": FPS / play.action_repeat}
         spaces: dict[str, gym.Space[Any]] = {"image": gym.Box(0, 255, (play.image_size, play.image_size, 3), np.uint8)}
         if reads(play.name):
-            text = benchmarks()["dmlab"]["text"]
-            spaces["instruction"] = gym.Box(-np.inf, np.inf, (text["slots"] * text["size"],), np.float32)
+            spaces["instruction"] = text.space("dmlab")
         self.observation_space = gym.Dict(spaces)
         self._actions = [np.array(action, np.intc) for action in benchmarks()["dmlab"]["actions"].values()]
         self.action_space = gym.Discrete(len(self._actions))
@@ -97,39 +92,11 @@ class DmLabEnv(gymnasium.Env[Any, Any]):
 
     def _observation(self) -> dict[str, np.ndarray]:
         found = self._lab.observations()
-        text = {"instruction": encode(found[INSTRUCTION])} if INSTRUCTION in found else {}
-        return {"image": found[IMAGE], **text}
+        said = {"instruction": text.encode("dmlab", found[INSTRUCTION])} if INSTRUCTION in found else {}
+        return {"image": found[IMAGE], **said}
 
     def render(self) -> np.ndarray:
         return self._seen["image"]
 
     def close(self) -> None:
         self._lab.close()
-
-
-# Instructions
-
-
-def encode(text: str) -> np.ndarray:
-    """An instruction as numbers [slots * size] in float32, by [dmlab.text] of spec/benchmarks.toml."""
-    entry = benchmarks()["dmlab"]["text"]
-    found = [bucket(token) for token in tokens(text)][: entry["slots"]]
-    return _table()[found + [0] * (entry["slots"] - len(found))].reshape(-1)
-
-
-def tokens(text: str) -> Sequence[str]:
-    """Words of letters and underscores, and what stands between words and spaces."""
-    found: list[str] = re.findall(benchmarks()["dmlab"]["text"]["tokens"], text.lower())
-    return found
-
-
-def bucket(token: str) -> int:
-    count: int = benchmarks()["dmlab"]["text"]["buckets"]
-    return zlib.crc32(token.encode()) % count
-
-
-@functools.cache
-def _table() -> np.ndarray:
-    """[buckets, size]"""
-    entry = benchmarks()["dmlab"]["text"]
-    return np.random.default_rng(entry["seed"]).normal(size=(entry["buckets"], entry["size"])).astype(np.float32)

@@ -12,7 +12,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces as gym
 
-from dreamer_spec.envs.suites import Play
+from dreamer_spec.envs.suites import Play, text
 from dreamer_spec.errors import UserError
 from dreamer_spec.options import did_you_mean
 
@@ -33,18 +33,19 @@ def make(play: Play, full_view: bool = False) -> gymnasium.Env[Any, Any]:
             f"unknown task {play.task!r}{did_you_mean(play.name, known)}; known are the {len(known)} ids of the "
             f"package, such as {known[0]}"
         )
-    env = gymnasium.make(play.name, render_mode="rgb_array" if play.render else None, disable_env_checker=True)
     try:
+        env = gymnasium.make(play.name, render_mode="rgb_array" if play.render else None, disable_env_checker=True)
         env.reset(seed=0)
     except FileNotFoundError as error:  # Those of WFC begin with pictures that the package as it is installed lacks.
         raise UserError(f"task {play.task}: a file of the package minigrid is missing: {error.filename}") from error
+    except gymnasium.error.DependencyNotInstalled as error:
+        raise UserError(f"task {play.task}: {error}") from error
     return MiniGridEnv(env, play, full_view)
 
 
 class MiniGridEnv(gymnasium.Env[Any, Any]):
     """image: what the agent sees, or the whole grid. direction: where it looks, which the former does not show.
-
-    The mission is text, which no observation can be; it stands in the info.
+    mission: the goal as numbers, unless it always says the same. As text it stands in the info.
     """
 
     def __init__(self, env: Any, play: Play, full_view: bool) -> None:
@@ -57,12 +58,12 @@ class MiniGridEnv(gymnasium.Env[Any, Any]):
                 f"task {play.task}: an image of {self._side} pixels is too small for {tiles} x {tiles} tiles; "
                 f"--image-size {LEAST_TILE * tiles} or more"
             )
-        self.observation_space = gym.Dict(
-            {
-                "image": gym.Box(0, 255, (self._side, self._side, 3), np.uint8),
-                "direction": env.observation_space["direction"],
-            }
-        )
+        self._tells = _varies(env.observation_space["mission"])
+        spaces = {
+            "image": gym.Box(0, 255, (self._side, self._side, 3), np.uint8),
+            "direction": env.observation_space["direction"],
+        }
+        self.observation_space = gym.Dict(spaces | ({"mission": text.space("minigrid")} if self._tells else {}))
         self.action_space = env.action_space
 
     def reset(
@@ -81,13 +82,19 @@ class MiniGridEnv(gymnasium.Env[Any, Any]):
         image = np.zeros((self._side, self._side, 3), np.uint8)
         top, left = (self._side - height) // 2, (self._side - width) // 2
         image[top : top + height, left : left + width] = drawn
-        return {"image": image, "direction": seen["direction"]}
+        mission = {"mission": text.encode("minigrid", seen["mission"])} if self._tells else {}
+        return {"image": image, "direction": seen["direction"], **mission}
 
     def render(self) -> Any:
         return self._env.render()
 
     def close(self) -> None:
         self._env.close()
+
+
+def _varies(mission: Any) -> bool:
+    """Whether the goal can change with the episode. BabyAI's space does not know: it takes any text."""
+    return bool(mission.ordered_placeholders) or "a text of its own" in mission
 
 
 def _registered() -> list[str]:
