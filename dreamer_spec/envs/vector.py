@@ -61,6 +61,7 @@ class Environments:
         trial: Trial | None = None,
         task: str = "",
     ) -> None:
+        self.count, self.is_vector = count, False
         self.failures = 0  # so far
         self._failures_allowed = failures_allowed
         self._failed_at: collections.deque[int] = (
@@ -75,16 +76,16 @@ class Environments:
         self.spaces: Spaces = known.translation.spaces
         self.frame_skip: int = known.frame_skip
         together = known.together if isinstance(known, Trial) else count_of(known)
-        self.is_vector = together is not None
-        self.count = count = together or count
+        if together:
+            self.count, self.is_vector = together, True
         self.info: list[dict[str, float]] = [
             {}
-        ] * count  # of the last records that end an episode: the numbers chosen by --info-metrics
+        ] * self.count  # of the last records that end an episode: the numbers chosen by --info-metrics
         self._episodes: dict[int, OngoingEpisode] = {}
-        self._action = np.zeros((count, self.spaces.action_size), np.float32)
+        self._action = np.zeros((self.count, self.spaces.action_size), np.float32)
         self._pending = False  # whether actions were sent off whose records have not been asked for
         self._workers: list[Worker] = []
-        self._places = [range(count)] if together else [range(index, index + 1) for index in range(count)]
+        self._places = [range(together)] if together else [range(index, index + 1) for index in range(count)]
         for index in range(len(self._places)):
             stream = functools.partial(
                 StreamEnv, make, index, known.task, self.translation, os.getpid(), together=together
