@@ -1,7 +1,9 @@
 """Vector environments give the records that their environments give one by one, in every mode."""
 
 import functools
+import itertools
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,6 +15,7 @@ from vector_fakes import COUNT, TROUBLE
 from dreamer_spec import cli, make_options
 from dreamer_spec.envs import Environments, Record, env_maker, make_env, random_actions
 from dreamer_spec.errors import UserError
+from dreamer_spec.monitoring.video import Film
 from reference_numpy.training_loop import derive_seed
 
 MODES = ["NextStep", "SameStep", "Disabled"]
@@ -49,7 +52,7 @@ def actions(envs: Environments) -> Iterator[np.ndarray]:
 
 def play(envs: Environments, steps: int = STEPS) -> tuple[list[Record], list[list[dict[str, float]]]]:
     records, infos = [envs.reset(SEEDS)], [envs.info]
-    for action in [action for action, _ in zip(actions(envs), range(steps), strict=False)]:
+    for action in itertools.islice(actions(envs), steps):
         records.append(envs.step(action))
         infos.append(envs.info)
     return records, infos
@@ -129,7 +132,7 @@ def test_a_vector_that_would_lose_a_first_observation_is_refused(make: Make, mod
 def test_what_follows_a_restore_is_what_would_have_followed(make: Make, mode: str, processes: bool) -> None:
     envs = make("sync", given={"mode": mode})
     records, histories, played = [envs.reset(SEEDS)], [envs.histories()], []
-    for action, _ in zip(actions(envs), range(40), strict=False):
+    for action in itertools.islice(actions(envs), 40):
         played.append(action)
         records.append(envs.step(action))
         histories.append(envs.histories())
@@ -191,7 +194,7 @@ def test_a_vector_that_fails_is_restarted_as_a_whole(make: Make, mode: str, trou
 def test_a_vector_whose_process_ends_is_restarted(make: Make) -> None:
     envs = make("Leaving", True)
     envs.reset(SEEDS)
-    records = [envs.step(action) for action, _ in zip(actions(envs), range(4), strict=False)]
+    records = [envs.step(action) for action in itertools.islice(actions(envs), 4)]
     assert [record["is_first"].all() for record in records].count(True) == 1
     assert [failure.kind for failure in envs.take_failures()] == ["crash"]
 
@@ -203,6 +206,31 @@ def test_columns_of_another_length_are_a_failure(make: Make) -> None:
     assert {failure.kind for failure in envs.take_failures()} == {"invalid data"}
     with pytest.raises(UserError, match=r"the rewards have the shape \(2,\); expected \(3,\)"):
         play(make("short", failures_allowed=0), 12)
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.covers("LOOP-66", "LOOP-74")
+def test_a_vector_of_one_can_be_lent(mode: str) -> None:
+    records = []
+    for name, given in (("sync", {"mode": mode, "count": 1}), ("Trip", None)):
+        envs = Environments(
+            functools.partial(make_env, f"vector_fakes:{name}", image_size=16, arguments=given), 1, False
+        )
+        envs.reset(SEEDS[:1])
+        envs.step(next(actions(envs)))
+        with envs.lend():
+            envs.reset([9])
+            envs.step(next(actions(envs)))
+        records.append([envs.next_episodes(), *(envs.step(action) for action in itertools.islice(actions(envs), 20))])
+        envs.close()
+    assert differ(*records) == []
+
+
+def test_a_vector_is_not_filmed(tmp_path: Path) -> None:
+    film = Film(tmp_path / "film.gif")
+    filmed = film.filming(functools.partial(make_env, "vector_fakes:sized", num_envs=2))
+    with pytest.raises(UserError, match="vector_fakes:sized is a vector environment, which cannot be filmed"):
+        filmed(0)
 
 
 def test_a_vector_must_say_when_it_resets() -> None:
@@ -223,7 +251,9 @@ def test_a_callable_with_num_envs_gets_the_number(make: Make) -> None:
     envs.close()
 
 
-def test_another_number_of_environments_is_refused_with_the_remedy(tmp_path: Any, capsys: Any) -> None:
+def test_another_number_of_environments_is_refused_with_the_remedy(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     options = ["--task", "vector_fakes:sync", "--env-arg", "mode=NextStep", "--logdir", str(tmp_path / "run")]
     code = cli.main(["--backend", "torch", *options, "--envs", "4", "--processes", "no", "--no-preflight"])
     assert code != 0
