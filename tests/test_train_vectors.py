@@ -260,3 +260,42 @@ def test_another_number_of_environments_is_refused_with_the_remedy(
     error = capsys.readouterr().err
     assert "is a vector of 3 environments, and this run is to have 4: add --envs 3" in error
     assert "Traceback" not in error
+
+
+@pytest.mark.parametrize("mode", MODES[:2])
+@pytest.mark.covers("LOOP-74")
+def test_the_vector_of_ale_is_that_of_its_single_games(mode: str) -> None:
+    pytest.importorskip("ale_py")
+    given = {"game": "pong", "max_num_frames_per_episode": 120, "img_height": 64, "img_width": 64, "noop_max": 5}
+
+    def records_of(numbers: list[int], **more: str) -> list[Record]:
+        maker = functools.partial(make_env, "ale_py:AtariVectorEnv", arguments={**given, **more}, num_envs=len(numbers))
+        envs = Environments(maker, len(numbers), False)
+        rng = np.random.default_rng(0)
+        records = [envs.reset([SEEDS[number] for number in numbers])]
+        for _ in range(70):
+            records.append(envs.step(random_actions(envs.spaces, rng, COUNT)[numbers]))
+        envs.close()
+        return records
+
+    together = records_of([0, 1, 2], autoreset_mode=mode)
+    for number in range(COUNT):
+        alone = records_of([number])
+        assert differ([{key: value[[number]] for key, value in record.items()} for record in together], alone) == []
+    assert sum(record["is_last"].sum() for record in together) >= 2 * COUNT
+
+
+@pytest.mark.covers("LOOP-11")
+def test_envpool_gives_first_and_last_records() -> None:
+    pytest.importorskip("envpool")
+    given = {"task_id": "CartPole-v1", "num_envs": COUNT, "seed": 7}
+    envs = Environments(functools.partial(make_env, "envpool:make_gymnasium", arguments=given), COUNT, False)
+    records, _ = play(envs, 150)
+    first, last = (np.stack([record[key] for record in records]) for key in ("is_first", "is_last"))
+    assert first[0].all()
+    assert first[1:].tolist() == last[:-1].tolist()
+    assert last.sum() > COUNT
+    positions = np.stack([record["observation"] for record in records])
+    assert np.abs(positions[first]).max() <= 0.05, "CartPole begins within this"
+    assert np.abs(positions[last & np.stack([record["is_terminal"] for record in records])][:, 2]).min() > 0.2
+    envs.close()

@@ -92,7 +92,7 @@ class ContractEnv(gymnasium.Env[Observation, np.ndarray]):
         self._steps += 1
         total = 0.0
         for _ in range(self._action_repeat):
-            value = self._env.step(self.translation.action(action))  # A new one: an environment may write into it.
+            value = self._act(action)
             if not isinstance(value, tuple) or len(value) != 5:
                 raise self._invalid(
                     f"step returned {_describe(value)}; Gymnasium's step returns (observation, reward, "
@@ -122,6 +122,9 @@ class ContractEnv(gymnasium.Env[Observation, np.ndarray]):
 
     def close(self) -> None:
         self._env.close()
+
+    def _act(self, action: np.ndarray) -> Any:
+        return self._env.step(self.translation.action(action))  # A new one: an environment may write into it.
 
     def _observation(self, value: Any) -> Observation:
         try:

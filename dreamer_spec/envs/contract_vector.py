@@ -60,7 +60,7 @@ class ContractVector:
         self._wants_info = bool(info_metrics)
         self._rows = [_Row(envs) for _ in range(self.count)]
         self._alone = [
-            ContractEnv(env, task, index, image_size, 1, info_metrics, observations, leave_out)
+            _Alone(env, task, index, image_size, 1, info_metrics, observations, leave_out)
             for index, env in enumerate(self._rows)
         ]
         self.translation: Translation = self._alone[0].translation
@@ -224,9 +224,8 @@ class ContractVector:
 
     def _batch(self, actions: np.ndarray) -> Any:
         space = self._envs.single_action_space
-        each = [self.translation.action(action) for action in actions]
         empty: Any = create_empty_array(space, self.count)
-        return concatenate(space, each, empty)
+        return concatenate(space, self.translation.batch_of_actions(actions), empty)
 
     def _row(self, batch: Any, index: int, count: int) -> Any:
         try:
@@ -267,6 +266,14 @@ class _Row(gymnasium.Env[Any, Any]):
 
     def step(self, action: Any) -> Any:
         return self.returned
+
+
+class _Alone(ContractEnv):
+    """Checks and translates what one environment of a vector has returned. Its action was translated with the
+    others."""
+
+    def _act(self, action: np.ndarray) -> Any:
+        return self._env.step(action)
 
 
 def _mode(envs: VectorEnv[Any, Any, Any], task: str) -> AutoresetMode:
