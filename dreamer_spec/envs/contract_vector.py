@@ -134,7 +134,7 @@ class ContractVector:
         for index in np.flatnonzero(acts).tolist():
             info = info_of(infos, index, self.count) if self._wants_info and self._over[index] else {}
             if self._over[index] and self._mode is AutoresetMode.SAME_STEP:
-                observation, info = self._final(infos, index), info.get("final_info", info)
+                observation, info = self._final(infos, index), info.get("final_info", {})
             else:
                 observation = self._row(self._observation, index, self.count)
             self._rows[index].returned = observation, rewards[index], terminated[index], truncated[index], info
