@@ -102,8 +102,9 @@ def make_options(
     """The options of a run. What each one means, `train --help` says; what is None comes from the preset.
 
     task: SUITE:NAME as on the command line, or a function or class that makes a gymnasium.Env, called with `env_arg`
-    for each environment. The run is then known by its name, `my_module:make_env`. It may be a lambda, or stand in the
-    script itself; environments that have processes of their own get it by cloudpickle.
+    for each environment, or a gymnasium.vector.VectorEnv of all of them. The run is then known by its name,
+    `my_module:make_env`. It may be a lambda, or stand in the script itself; environments that have processes of their
+    own get it by cloudpickle.
     hyperparameters: by their names in spec/hyperparameters.md, such as learning_rate=1e-4.
 
     Raises:

@@ -79,13 +79,23 @@ class Translation:
         Raises:
           ValueError: a wrong shape or a number that is not finite.
         """
+        return self.batch_of_actions(np.asarray(flat)[None])[0]
+
+    def batch_of_actions(self, flat: np.ndarray) -> list[Any]:
+        """`action` of each of N flat actions [N, A]; one call, because each takes as long as a step of a simple
+        environment."""
         reals = {key: entry for key, entry in self.actions.items() if isinstance(self.spaces.actions[key], Vector)}
         low, high = (
             {key: np.broadcast_to(getattr(entry, bound), math.prod(entry.shape)) for key, entry in reals.items()}
             for bound in ("low", "high")
         )
         parts = environment_action(flat, self.spaces, low, high)
-        return _nested([(entry.path, _decode(parts[key], entry, key in reals)) for key, entry in self.actions.items()])
+        return [
+            _nested(
+                [(entry.path, _decode(parts[key][row], entry, key in reals)) for key, entry in self.actions.items()]
+            )
+            for row in range(len(flat))
+        ]
 
     def differences(self, other: "Translation") -> list[str]:
         """A text for each key that is not the same in another environment."""

@@ -121,6 +121,10 @@ def make_env(level=1, goals=()):
     first, two = spaces.Box(box.low[:1], box.high[:1]), spaces.Box(box.low[:2], box.high[:2])
     parts = {"arm_angle": box, "camera": two, "debug_time": first}
     return gymnasium.wrappers.TransformObservation(cartpole, seen, spaces.Dict(parts))
+
+
+def make_envs(num_envs, seed=0):
+    return gymnasium.vector.SyncVectorEnv([make_env] * num_envs)
 """
     )
     (folder / "expected.toml").write_text("")

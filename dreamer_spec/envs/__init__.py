@@ -2,6 +2,7 @@
 parallel."""
 
 from dreamer_spec.envs.adapter import ContractEnv
+from dreamer_spec.envs.contract_vector import Adapted, ContractVector
 from dreamer_spec.envs.factory import env_maker, make_env
 from dreamer_spec.envs.failure import Failure
 from dreamer_spec.envs.history import History
@@ -12,7 +13,9 @@ from dreamer_spec.envs.vector import Environments
 from dreamer_spec.translation import Translation
 
 __all__ = [
+    "Adapted",
     "ContractEnv",
+    "ContractVector",
     "Environments",
     "Failure",
     "History",

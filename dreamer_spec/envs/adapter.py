@@ -13,6 +13,7 @@ from dreamer_spec.envs.frames import frame_skip
 from dreamer_spec.envs.info import EpisodeInfo, chosen
 from dreamer_spec.envs.spaces import translate
 from dreamer_spec.errors import UserError
+from dreamer_spec.words import counted
 from reference_numpy.training_loop import derive_seed
 from spec import Discrete, Image, Spaces, Vector
 
@@ -91,7 +92,7 @@ class ContractEnv(gymnasium.Env[Observation, np.ndarray]):
         self._steps += 1
         total = 0.0
         for _ in range(self._action_repeat):
-            value = self._env.step(self.translation.action(action))  # A new one: an environment may write into it.
+            value = self._act(action)
             if not isinstance(value, tuple) or len(value) != 5:
                 raise self._invalid(
                     f"step returned {_describe(value)}; Gymnasium's step returns (observation, reward, "
@@ -121,6 +122,9 @@ class ContractEnv(gymnasium.Env[Observation, np.ndarray]):
 
     def close(self) -> None:
         self._env.close()
+
+    def _act(self, action: np.ndarray) -> Any:
+        return self._env.step(self.translation.action(action))  # A new one: an environment may write into it.
 
     def _observation(self, value: Any) -> Observation:
         try:
@@ -154,9 +158,11 @@ class ContractEnv(gymnasium.Env[Observation, np.ndarray]):
         return InvalidData(f"{where(self.task, self._index, self._steps)}: {message}")
 
 
-def where(task: str, index: int, steps: int) -> str:
-    """The place of an error: in which environment, at which of its steps since it was made, resets not counted."""
-    return f"task {task}, environment {index}, step {steps}"
+def where(task: str, index: int, steps: int, together: int | None = None) -> str:
+    """The place of an error: in which environment, or vector of so many, at which of its steps since it was made,
+    resets not counted."""
+    which = f"vector of {counted(together, 'environment')}" if together else f"environment {index}"
+    return f"task {task}, {which}, step {steps}"
 
 
 def array_spaces(spaces: Spaces) -> tuple[gym.Space[Any], gym.Space[Any]]:

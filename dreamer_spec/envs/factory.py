@@ -2,7 +2,8 @@
 
 gym:ID                   any registered Gymnasium id: gym:CartPole-v1, gym:ALE/Pong-v5; of a module: gym:module:ID
 SUITE:NAME               a task of a suite with a protocol: atari:pong, dmc:walker-walk; `train tasks` lists them
-MODULE:CALLABLE          your own, a function or class that returns a gymnasium.Env: my_package.my_module:make_env
+MODULE:CALLABLE          your own, a function or class that returns a gymnasium.Env or a gymnasium.vector.VectorEnv:
+                         my_package.my_module:make_env
 
 A script may give the callable itself; its task is then its name.
 """
@@ -19,11 +20,13 @@ from typing import Any
 
 import gymnasium
 from gymnasium.envs.registration import EnvSpec
+from gymnasium.vector import VectorEnv
 
 from conformance.own_names import ours, ours_in
 from dreamer_spec import arguments as keywords
 from dreamer_spec.envs import suites
 from dreamer_spec.envs.adapter import ContractEnv
+from dreamer_spec.envs.contract_vector import Adapted, ContractVector
 from dreamer_spec.envs.info import names_of
 from dreamer_spec.envs.sending import known_here, register, require_sendable
 from dreamer_spec.errors import UserError
@@ -38,8 +41,8 @@ _NAMESPACES = {"ALE": ("ale_py", "atari")}
 _EXTRAS = {"box2d": "box2d", "mujoco": "mujoco", "classic_control": "train"}
 
 
-def env_maker(options: Options, render: bool = False) -> Callable[[int], ContractEnv]:
-    """index -> the environment that these options describe.
+def env_maker(options: Options, render: bool = False) -> Callable[[int], Adapted]:
+    """index -> the environment that these options describe, or a vector of all.
 
     Raises:
       UserError: a module that cannot be imported, because its name is ours; a callable that no process can be given.
@@ -73,6 +76,7 @@ def env_maker(options: Options, render: bool = False) -> Callable[[int], Contrac
         leave_out=options.leave_out,
         make=options.make,
         registered=registered,
+        num_envs=options.config.envs,
     )
 
 
@@ -89,22 +93,26 @@ def make_env(
     leave_out: Sequence[str] = (),
     make: Callable[..., Any] | None = None,
     registered: Sequence[EnvSpec] = (),
-) -> ContractEnv:
-    """The environment of a task string, adapted. `index` numbers the instances of a run, for messages. render: with the
-    render mode "rgb_array", where the environment has one. arguments: keyword arguments with which the environment is
-    made. time_limit: frames after which an episode is truncated, in place of the suite's limit: [LOOP-62]. make: the
-    callable that makes the environment; the task is only its name then. registered: ids that Gymnasium shall know. The
-    others: see `ContractEnv`.
+    num_envs: int | None = None,
+) -> Adapted:
+    """The environment of a task string, or the vector that its callable returns, adapted. `index` numbers the instances
+    of a run, for messages. render: with the render mode "rgb_array", where the environment has one. arguments: keyword
+    arguments with which the environment is made. time_limit: frames after which an episode is truncated, in place of
+    the suite's limit: [LOOP-62]. make: the callable that makes the environment; the task is only its name then.
+    registered: ids that Gymnasium shall know. The others: see `ContractEnv`. num_envs: what a callable gets that has an
+    argument of this name; [LOOP-74].
 
     Raises:
       UserError: an unknown task, a package that is not installed (with the pip command), arguments that the environment
-      does not take, an unsupported space.
+      does not take, an unsupported space, an action repeat or a time limit for a vector.
     """
     register(registered)
     arguments = arguments or {}
     if make is not None:
-        env = _limited(_call(task, make, render, arguments), time_limit)
-        return ContractEnv(env, task, index, image_size, action_repeat, info_metrics, observations, leave_out)
+        called = _call(task, make, render, arguments, num_envs)
+        return _adapted(
+            called, task, index, image_size, action_repeat, time_limit, info_metrics, observations, leave_out
+        )
     suite, separator, name = task.partition(":")
     if not separator or not suite or not name:
         raise UserError(f"unknown task {task!r}; expected {EXPECTED}")
@@ -118,8 +126,34 @@ def make_env(
         env = env if traits.limits else _limited(env, time_limit)
         action_repeat = 1 if traits.repeats else action_repeat
     else:
-        env = _limited(_call(task, _find_own(task, suite, name), render, arguments), time_limit)
+        called = _call(task, _find_own(task, suite, name), render, arguments, num_envs)
+        return _adapted(
+            called, task, index, image_size, action_repeat, time_limit, info_metrics, observations, leave_out
+        )
     return ContractEnv(env, task, index, image_size, action_repeat, info_metrics, observations, leave_out)
+
+
+def _adapted(
+    env: gymnasium.Env[Any, Any] | VectorEnv[Any, Any, Any],
+    task: str,
+    index: int,
+    image_size: int,
+    action_repeat: int,
+    time_limit: int | None,
+    *choice: Sequence[str],
+) -> Adapted:
+    """What a callable has returned, adapted. choice: info_metrics, observations, leave_out."""
+    if not isinstance(env, VectorEnv):
+        return ContractEnv(_limited(env, time_limit), task, index, image_size, action_repeat, *choice)
+    given = {"--action-repeat": action_repeat if action_repeat != 1 else None, "--time-limit": time_limit}
+    for option, value in given.items():
+        if value:
+            raise UserError(
+                f"task {task} is a vector environment, whose environments cannot be wrapped from outside: leave out "
+                f"{option} {value}, and apply it inside the vector, such as by an argument (--env-arg) or in the "
+                f"functions that make its environments"
+            )
+    return ContractVector(env, task, image_size, *choice)
 
 
 def _limited(env: gymnasium.Env[Any, Any], time_limit: int | None) -> gymnasium.Env[Any, Any]:
@@ -213,16 +247,29 @@ def _find_own(task: str, module_name: str, name: str) -> Callable[..., Any]:
 
 
 def _call(
-    task: str, function: Callable[..., Any], render: bool, arguments: Mapping[str, Any]
-) -> gymnasium.Env[Any, Any]:
-    if render and "render_mode" in inspect.signature(function).parameters:
-        arguments = {**arguments, "render_mode": "rgb_array"}
+    task: str, function: Callable[..., Any], render: bool, arguments: Mapping[str, Any], num_envs: int | None
+) -> gymnasium.Env[Any, Any] | VectorEnv[Any, Any, Any]:
+    given = dict(arguments)
+    if render and _takes(function, "render_mode"):
+        given["render_mode"] = "rgb_array"
+    if num_envs is not None and _takes(function, "num_envs"):
+        given.setdefault("num_envs", num_envs)
     with _naming(task, arguments), _not_ours(task):
-        env = function(**arguments)
-    if not isinstance(env, gymnasium.Env):
+        env = function(**given)
+    if not isinstance(env, gymnasium.Env | VectorEnv):
         name = task.partition(":")[2]
-        raise UserError(f"task {task}: {name}() returned a {type(env).__name__}; expected a gymnasium.Env")
+        raise UserError(
+            f"task {task}: {name}() returned a {type(env).__name__}; expected a gymnasium.Env or a "
+            f"gymnasium.vector.VectorEnv"
+        )
     return env
+
+
+def _takes(function: Callable[..., Any], name: str) -> bool:
+    try:
+        return name in inspect.signature(function).parameters
+    except ValueError:  # Code in C may not say.
+        return False
 
 
 def _import_own(task: str, module_name: str) -> Any:

@@ -11,6 +11,7 @@ from dreamer_spec.envs.adapter import InvalidData
 from dreamer_spec.envs.factory import Refusal
 from dreamer_spec.errors import UserError
 from dreamer_spec.system.signals import Stopped
+from dreamer_spec.words import counted
 
 Result = TypeVar("Result")
 
@@ -24,8 +25,9 @@ LONGEST = 1_000, 20_000  # characters of an exception's text, and of a traceback
 class Failure:
     """An environment did not give its next record.
 
-    worker: its index. kind: its process ended ("crash"), it raised ("error"), did not answer in time ("timeout"), or
-    returned what its spaces do not allow ("invalid data"). message: names task, environment and step. details: the
+    worker: its index, 0 of a vector. kind: its process ended ("crash"), it raised ("error"), did not answer in time
+    ("timeout"), or returned what its spaces do not allow ("invalid data"). together: how many environments a vector
+    has. message: names task, environment and step. details: the
     traceback of an error, else empty.
     certain: whether another attempt would end alike, as with a task that does not exist.
     """
@@ -35,6 +37,13 @@ class Failure:
     message: str
     details: str = ""
     certain: bool = False
+    together: int | None = None
+
+    @property
+    def who(self) -> str:
+        return (
+            f"the vector of {counted(self.together, 'environment')}" if self.together else f"environment {self.worker}"
+        )
 
     def is_final(self, attempts: int) -> bool:
         """Whether so many attempts to get a first record were enough."""

@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 from gymnasium.vector.utils import CloudpickleWrapper
 
-from dreamer_spec.envs.adapter import ContractEnv
+from dreamer_spec.envs.contract_vector import Adapted, ContractVector, count_of
 from dreamer_spec.envs.failure import Failure, attempt
 from dreamer_spec.envs.guest import guest
+from dreamer_spec.envs.history import History
 from dreamer_spec.envs.process import (
     CLOSING,
     DYING,
@@ -26,17 +27,19 @@ from dreamer_spec.envs.process import (
     starting,
 )
 from dreamer_spec.envs.spaces import random_actions
+from dreamer_spec.envs.steps import is_last
 from dreamer_spec.translation import Translation
 
 SLOW_STEP = 5e-4  # seconds; from here on a process of its own is faster than taking turns
 
-Make = Callable[[int], ContractEnv]
+Make = Callable[[int], Adapted]
 Tell = Callable[[Failure], None]
 
 
 @dataclasses.dataclass(frozen=True)
 class Trial:
-    """task, translation, frame_skip: of all environments.
+    """task, translation, frame_skip: of all environments. together: how many a vector has; None where they are made one
+    by one.
 
     deserves_process: because its steps are slow, or because it failed when it was tried out.
     """
@@ -44,6 +47,7 @@ class Trial:
     task: str
     translation: Translation
     frame_skip: int
+    together: int | None = None
     deserves_process: bool = True
 
 
@@ -62,20 +66,22 @@ def try_out(make: Make, tell: Tell, task: str = "", seed: int | None = None, tim
         with _process(make, task, seed, timeout) as receive:
             made = receive("when it was made")
             if not isinstance(made, Failure):
-                known_task, translation, frame_skip = made
-                return Trial(known_task, translation, frame_skip, seed is None or _deserves_process(receive, tell))
+                known_task, translation, frame_skip, together = made
+                return Trial(
+                    known_task, translation, frame_skip, together, seed is None or _deserves_process(receive, tell)
+                )
         attempts += 1
         _require_another(made, attempts, tell)
 
 
-def make_here(make: Make, tell: Tell, task: str = "") -> ContractEnv:
+def make_here(make: Make, tell: Tell, task: str = "") -> Adapted:
     """The first environment, in this process.
 
     Raises:
       UserError: it cannot be made in three attempts.
     """
 
-    def make_once() -> ContractEnv | Failure:
+    def make_once() -> Adapted | Failure:
         with guest():
             return attempt(lambda: make(0), 0, lambda: _place(task, "when it was made"))
 
@@ -107,13 +113,14 @@ def _deserves_process(receive: Callable[[str], Any], tell: Tell) -> bool:
 @contextlib.contextmanager
 def _process(make: Make, task: str, seed: int | None, timeout: float) -> Iterator[Callable[[str], Any]]:
     """A function that returns the next answer of `_look`, or a Failure."""
+    sent: Any = functools.partial(make, 0)
     try:
         context: Any = multiprocessing.get_context(start_method())
         with starting():
             ours, theirs = context.Pipe(duplex=False)
             process = context.Process(
-                target=_look, args=(CloudpickleWrapper(functools.partial(make, 0)), task, seed, theirs), daemon=True
-            )
+                target=_look, args=(CloudpickleWrapper(sent), task, seed, theirs)
+            )  # No daemon, which could not make a vector with processes of its own.
             process.start()
             theirs.close()
     except (Exception, SystemExit) as error:  # What is pickled may raise anything.
@@ -144,7 +151,7 @@ def _process(make: Make, task: str, seed: int | None, timeout: float) -> Iterato
         ours.close()
 
 
-def _look(make: Callable[[], ContractEnv], task: str, seed: int | None, pipe: connection.Connection) -> None:
+def _look(make: Callable[[], Adapted], task: str, seed: int | None, pipe: connection.Connection) -> None:
     """Runs in the process. Answers with the task and its spaces, then with None after a reset, then with the seconds of
     a step."""
     begin_worker()
@@ -152,7 +159,7 @@ def _look(make: Callable[[], ContractEnv], task: str, seed: int | None, pipe: co
     if isinstance(env, Failure):
         pipe.send(env)
         return
-    pipe.send((env.task, env.translation, env.frame_skip))
+    pipe.send((env.task, env.translation, env.frame_skip, count_of(env)))
     if seed is not None:
         began = attempt(lambda: _begin(env, seed), 0, lambda: _place(task, "at its first reset"))
         pipe.send(began)
@@ -161,18 +168,23 @@ def _look(make: Callable[[], ContractEnv], task: str, seed: int | None, pipe: co
     attempt(env.close, 0, lambda: _place(task, "when it was closed"))
 
 
-def _begin(env: ContractEnv, seed: int) -> None:
-    env.reset(seed=seed)
+def _begin(env: Adapted, seed: int) -> None:
+    if isinstance(env, ContractVector):
+        nothing = np.zeros((0, env.spaces.action_size), np.float32)
+        env.resume([History(seed + index, 0, nothing) for index in range(env.count)])
+    else:
+        env.reset(seed=seed)
 
 
-def _seconds(env: ContractEnv, seed: int) -> float:
+def _seconds(env: Adapted, seed: int) -> float:
     """That a step takes: the mean over 100 random steps, or over 0.3 seconds."""
     rng = np.random.default_rng(seed)
     start, steps = time.perf_counter(), 0
     while steps < 100 and time.perf_counter() - start < 0.3:
-        _, _, terminated, truncated, _ = env.step(random_actions(env.spaces, rng, 1)[0])
         steps += 1
-        if terminated or truncated:
+        if isinstance(env, ContractVector):
+            env.step(random_actions(env.spaces, rng, env.count))
+        elif is_last(env.step(random_actions(env.spaces, rng, 1)[0])):
             env.reset()
     return (time.perf_counter() - start) / steps
 

@@ -1,20 +1,25 @@
-"""N environments side by side, each a stream of records as in spec/00-notation.md, and each restarted when it fails."""
+"""N environments side by side, each a stream of records as in spec/00-notation.md, made one by one or as a vector, and
+restarted when they fail."""
 
 import collections
 import contextlib
 import dataclasses
+import functools
+import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 
-from dreamer_spec.envs.adapter import ContractEnv
+from dreamer_spec.envs.adapter import where
+from dreamer_spec.envs.contract_vector import Adapted, count_of
 from dreamer_spec.envs.failure import Failure
 from dreamer_spec.envs.history import History, OngoingEpisode
 from dreamer_spec.envs.info import EpisodeInfo
 from dreamer_spec.envs.process import CLOSING
 from dreamer_spec.envs.records import Record, observed
-from dreamer_spec.envs.stream import Step
+from dreamer_spec.envs.steps import Step
+from dreamer_spec.envs.stream import StreamEnv
 from dreamer_spec.envs.trial import Trial, make_here, try_out
 from dreamer_spec.envs.worker import InProcess, OwnProcess, Worker, receive
 from dreamer_spec.errors import UserError
@@ -38,7 +43,8 @@ class Environments:
     and all after it.
 
     An environment that crashes, raises, hangs or returns what its spaces do not allow is restarted: another is made and
-    reset; its next record has `is_first`, and the others go on undisturbed: [LOOP-32].
+    reset; its next record has `is_first`, and the others go on undisturbed: [LOOP-32]. Where `make` gives a vector,
+    there are as many environments as it has, whatever `count` says, and they are restarted together: [LOOP-74].
 
     Raises:
       UserError: from here, if the first environment cannot be made; from `reset` and `finish`, if an environment gives
@@ -47,7 +53,7 @@ class Environments:
 
     def __init__(
         self,
-        make: Callable[[int], ContractEnv],
+        make: Callable[[int], Adapted],
         count: int,
         processes: bool,
         timeout: float = 600.0,
@@ -55,11 +61,8 @@ class Environments:
         trial: Trial | None = None,
         task: str = "",
     ) -> None:
-        self.count = count
+        self.count, self.is_vector = count, False
         self.failures = 0  # so far
-        self.info: list[dict[str, float]] = [
-            {}
-        ] * count  # of the last records that end an episode: the numbers chosen by --info-metrics
         self._failures_allowed = failures_allowed
         self._failed_at: collections.deque[int] = (
             collections.deque()
@@ -68,32 +71,42 @@ class Environments:
         self._attempts = collections.Counter[int]()  # of each worker to give its first record
         self._records = 0
         first = None if processes else make_here(make, self._count, task)
-        known = first or trial or try_out(make, self._count, task, timeout=timeout)
+        known = trial or try_out(make, self._count, task, timeout=timeout) if first is None else first
         self.translation: Translation = known.translation
         self.spaces: Spaces = known.translation.spaces
         self.frame_skip: int = known.frame_skip
+        together = known.together if isinstance(known, Trial) else count_of(known)
+        if together:
+            self.count, self.is_vector = together, True
+        self.info: list[dict[str, float]] = [
+            {}
+        ] * self.count  # of the last records that end an episode: the numbers chosen by --info-metrics
         self._episodes: dict[int, OngoingEpisode] = {}
-        self._action = np.zeros((count, self.spaces.action_size), np.float32)
+        self._action = np.zeros((self.count, self.spaces.action_size), np.float32)
         self._pending = False  # whether actions were sent off whose records have not been asked for
         self._workers: list[Worker] = []
-        for index in range(count):
+        self._places = [range(together)] if together else [range(index, index + 1) for index in range(count)]
+        for index in range(len(self._places)):
+            stream = functools.partial(
+                StreamEnv, make, index, known.task, self.translation, os.getpid(), together=together
+            )
+            place = functools.partial(where, known.task, index, together=together)
             if processes:
-                self._workers.append(OwnProcess(make, index, known.task, self.translation, timeout))
+                self._workers.append(OwnProcess(stream, index, place, timeout, together))
             else:
-                self._workers.append(InProcess(make, index, known.task, self.translation, None if index else first))
+                self._workers.append(InProcess(stream, None if index else first))
 
     def reset(self, seeds: Sequence[int]) -> Record:
         """The first records of new episodes, [N, ...] each."""
         self._settle()
-        for worker, seed in enumerate(seeds):
-            self._begin(worker, self._fresh(seed))
+        self._begin_all([self._fresh(seed) for seed in seeds])
         return self._record(self._receive())
 
     def start(self, action: np.ndarray) -> None:
         """Sends flat actions [N, A]; where the last record was the last of an episode, the action is ignored."""
         self._action, self._pending = np.array(action, np.float32), True
-        for worker, own in zip(self._workers, self._action, strict=True):
-            worker.step(own)
+        for worker, places in zip(self._workers, self._places, strict=True):
+            worker.step(self._action if self.is_vector else self._action[places[0]])
 
     def finish(self) -> Record:
         """The records that follow the actions, [N, ...] each."""
@@ -126,10 +139,10 @@ class Environments:
         ]
         if len(fitting) != self.count:
             return None
-        for worker, history in enumerate(fitting):
-            self._begin(worker, history)
-            self._action[worker] = history.actions[-1] if len(history.actions) else 0
-        steps, failures = self._ask(range(self.count))
+        self._begin_all(fitting)
+        for index, history in enumerate(fitting):
+            self._action[index] = history.actions[-1] if len(history.actions) else 0
+        steps, failures = self._ask(range(len(self._workers)))
         for failure in failures:
             self._end(failure)
         return None if failures else self._record(steps)
@@ -149,8 +162,8 @@ class Environments:
     def next_episodes(self) -> Record:
         """The first records [N, ...] of the episodes that follow those whose last records were given, as `finish` would
         give them."""
-        for worker, episode in self._episodes.items():
-            self._begin(worker, dataclasses.replace(self._fresh(episode.seed), episode=episode.number + 1))
+        episodes = [self._episodes[index] for index in range(self.count)]
+        self._begin_all([dataclasses.replace(self._fresh(own.seed), episode=own.number + 1) for own in episodes])
         return self._record(self._receive())
 
     def take_failures(self) -> list[Failure]:
@@ -174,19 +187,25 @@ class Environments:
         if self._pending:
             self.finish()
 
-    def _begin(self, worker: int, history: History) -> None:
-        self._workers[worker].begin(history)
-        self._episodes[worker] = OngoingEpisode(history)
+    def _begin_all(self, histories: Sequence[History]) -> None:
+        for worker, places in enumerate(self._places):
+            self._begin(worker, [histories[index] for index in places])
+
+    def _begin(self, worker: int, histories: Sequence[History]) -> None:
+        self._workers[worker].begin(histories)
+        for index, history in zip(self._places[worker], histories, strict=True):
+            self._episodes[index] = OngoingEpisode(history)
 
     def _receive(self) -> dict[int, Step]:
-        """One step of every worker; those that fail are restarted until they give the first record of an episode:
+        """One step of every environment; those that fail are restarted until they give the first record of an episode:
         [LOOP-32]."""
-        steps, failures = self._ask(range(self.count))
+        steps, failures = self._ask(range(len(self._workers)))
         while failures:
             for failure in failures:
                 self._count(failure)
                 self._end(failure)
-                self._begin(failure.worker, self._fresh(derive_seed(self._episodes[failure.worker].seed, "restart", 0)))
+                seeds = [self._episodes[index].seed for index in self._places[failure.worker]]
+                self._begin(failure.worker, [self._fresh(derive_seed(seed, "restart", 0)) for seed in seeds])
             again, failures = self._ask([failure.worker for failure in failures])
             steps |= again
         return steps
@@ -194,13 +213,16 @@ class Environments:
     def _ask(self, workers: Iterable[int]) -> tuple[dict[int, Step], list[Failure]]:
         """What the workers have done, and what went wrong."""
         answers = receive({worker: self._workers[worker] for worker in workers})
-        steps = {worker: answer for worker, answer in answers.items() if not isinstance(answer, Failure)}
+        steps: dict[int, Step] = {}
+        for worker, answer in answers.items():
+            if not isinstance(answer, Failure):
+                steps.update(zip(self._places[worker], answer, strict=True))
         return steps, [answer for answer in answers.values() if isinstance(answer, Failure)]
 
     def _count(self, failure: Failure) -> None:
         """Raises a UserError where there were too many."""
         self.failures += 1
-        self._untold.append(failure)
+        self._untold.append(dataclasses.replace(failure, together=self.count if self.is_vector else None))
         self._failed_at.append(self._records)
         while self._failed_at[0] <= self._records - WINDOW:
             self._failed_at.popleft()

@@ -1,12 +1,11 @@
-"""One stream, in this process or in one of its own, behind the same functions. What goes wrong comes back as a
-`Failure`."""
+"""One stream, of an environment or of a vector, in this process or in one of its own, behind the same functions. What
+goes wrong comes back as a `Failure`."""
 
 import contextlib
 import functools
 import multiprocessing
-import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from multiprocessing import connection
 from typing import Any, Literal
 
@@ -14,51 +13,50 @@ import numpy as np
 from gymnasium.error import AlreadyPendingCallError, NoAsyncCallError
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 
-from dreamer_spec.envs.adapter import ContractEnv, where
+from dreamer_spec.envs.contract_vector import Adapted
 from dreamer_spec.envs.failure import Failure
 from dreamer_spec.envs.guest import guest
 from dreamer_spec.envs.history import History
 from dreamer_spec.envs.process import DYING, ended, no_answer, not_started, start_method, starting
-from dreamer_spec.envs.stream import Step, StreamEnv
-from dreamer_spec.translation import Translation
+from dreamer_spec.envs.steps import Step, separate
+from dreamer_spec.envs.stream import StreamEnv
 
 # What Gymnasium raises where the process has ended: when something is received, when it is sent, and when that had
 # failed.
 GONE = (EOFError, OSError, NoAsyncCallError)
+
+Answer = list[Step] | Failure  # a step of each environment of the stream
 
 
 class InProcess:
     """Works when it is asked for its answer, and for as long as the environment takes: nobody could notice that it
     hangs.
 
-    env: the environment, if it has been made already.
+    make_stream: env -> stream of that environment, or of one that it makes itself. env: the environment, if it has been
+    made already.
     """
 
-    def __init__(
-        self,
-        make: Callable[[int], ContractEnv],
-        index: int,
-        task: str,
-        translation: Translation,
-        env: ContractEnv | None,
-    ) -> None:
-        self._make_stream = functools.partial(StreamEnv, make, index, task, translation, os.getpid())
+    def __init__(self, make_stream: Callable[..., StreamEnv], env: Adapted | None = None) -> None:
+        self._make_stream = make_stream
         self._stream = self._make_stream(env)
         self._work: Callable[[], Step] | None = None
 
-    def begin(self, history: History) -> None:
-        """Makes the environment if there is none, resets it, and replays the actions of the history: [LOOP-34]."""
-        self._work = functools.partial(self._stream.resume, history)
+    def begin(self, histories: Sequence[History]) -> None:
+        """Makes the environment if there is none, resets it, and replays the actions of its history: [LOOP-34].
+
+        histories: as many as there are environments in the stream.
+        """
+        self._work = functools.partial(self._stream.resume, histories)
 
     def step(self, action: np.ndarray) -> None:
-        """Sends a flat action [A] off."""
+        """Sends a flat action [A] off, or those [N, A] of a vector."""
         self._work = functools.partial(self._stream.step, action)
 
-    def receive(self) -> Step | Failure:
+    def receive(self) -> Answer:
         """What followed."""
         assert self._work is not None, "nothing was sent off"
         step = self._work()
-        return step[4].get("failure", step)
+        return step[4].get("failure") or separate(step)
 
     def shut(self) -> None:
         """Asks the environment to close. After this and `kill`, `begin` makes a new one."""
@@ -73,15 +71,21 @@ class InProcess:
 class OwnProcess:
     """A vector environment of one: its process can be killed and another started, and no other worker notices.
 
-    timeout: seconds for an answer. patience: the same, or more while actions are replayed. pipe: through which the
-    answer comes.
+    make_stream: of its environment. place: how many steps -> where that is, for messages. timeout: seconds for an
+    answer. together: how many environments a vector has; it may have processes of its own. patience: the timeout, or
+    more while actions are replayed. pipe: through which the answer comes.
     """
 
     def __init__(
-        self, make: Callable[[int], ContractEnv], index: int, task: str, translation: Translation, timeout: float
+        self,
+        make_stream: Callable[[], StreamEnv],
+        index: int,
+        place: Callable[[int], str],
+        timeout: float,
+        together: int | None = None,
     ) -> None:
-        self._make_stream = functools.partial(StreamEnv, make, index, task, translation, os.getpid())
-        self._index, self._task, self._timeout = index, task, timeout
+        self._make_stream = make_stream
+        self._index, self._place, self._timeout, self._together = index, place, timeout, together
         self._envs: AsyncVectorEnv | None = None
         self._wait: Callable[[float | None], Step] = self._wait_for_reset
         self._steps = 0
@@ -95,22 +99,24 @@ class OwnProcess:
         """The worker process."""
         return self._running().processes[0]
 
-    def begin(self, history: History) -> None:
-        replayed = len(history.actions)
+    def begin(self, histories: Sequence[History]) -> None:
+        replayed = max(len(history.actions) for history in histories)
         self._wait, self.patience, self._steps = self._wait_for_reset, self._timeout * (1 + replayed), replayed
         if self._envs is None:
             self._start()
         with contextlib.suppress(*GONE):  # `receive` will say so.
-            self._running().reset_async(
-                seed=[history.seed], options={"episode": history.episode, "actions": history.actions}
-            )
+            self._running().reset_async(options={"histories": histories})
 
     def _start(self) -> None:
         try:
             with starting():
                 makers = [self._make_stream]
                 self._envs = AsyncVectorEnv(
-                    makers, copy=False, context=start_method(), autoreset_mode=AutoresetMode.DISABLED
+                    makers,
+                    copy=False,
+                    context=start_method(),
+                    daemon=self._together is None,  # A daemon may not start processes, as AsyncVectorEnv does.
+                    autoreset_mode=AutoresetMode.DISABLED,
                 )
                 (self.pipe,) = self._envs.parent_pipes
         except (Exception, SystemExit) as error:  # `receive` will say so. What is pickled may raise anything.
@@ -122,7 +128,7 @@ class OwnProcess:
         with contextlib.suppress(*GONE):
             self._running().step_async(action[None])
 
-    def receive(self) -> Step | Failure:
+    def receive(self) -> Answer:
         try:
             step = self._wait(None)
         except GONE:
@@ -130,7 +136,7 @@ class OwnProcess:
         self._ended = step[2] or step[3]
         if "failure" in step[4]:
             return step[4]["failure"][0]
-        return (*step[:4], {"metrics": step[4]["metrics"][0]} if "metrics" in step[4] else {})
+        return separate((*step[:4], {name: step[4][name][0] for name in ("metrics", "batch") if name in step[4]}))
 
     def expired(self) -> Failure:
         """The answer that stands for none within `patience` seconds."""
@@ -174,17 +180,17 @@ class OwnProcess:
         return ended(self.process.exitcode)
 
     def _failure(self, kind: Literal["crash", "timeout"], what: str) -> Failure:
-        message = f"{where(self._task, self._index, self._steps)}: {what}"
+        message = f"{self._place(self._steps)}: {what}"
         return Failure(self._index, kind, message, certain=self._envs is None)
 
 
 Worker = InProcess | OwnProcess
 
 
-def receive(workers: Mapping[int, Worker]) -> dict[int, Step | Failure]:
+def receive(workers: Mapping[int, Worker]) -> dict[int, Answer]:
     """The answers of these workers, in the order given. They are waited for together, as long as the most patient of
     them allows."""
-    answers: dict[int, Step | Failure] = {}
+    answers: dict[int, Answer] = {}
     waiting: dict[connection.Connection, tuple[int, OwnProcess]] = {}
     here: dict[int, Worker] = {}
     for index, worker in workers.items():

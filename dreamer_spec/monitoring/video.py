@@ -11,7 +11,7 @@ import gymnasium
 import numpy as np
 from PIL import Image as Pillow
 
-from dreamer_spec.envs import ContractEnv
+from dreamer_spec.envs import Adapted, ContractEnv, ContractVector
 from dreamer_spec.errors import UserError, writing
 
 MOST_FRAMES = 400  # in memory: of a longer episode every second one is kept, or every fourth, ...
@@ -40,9 +40,23 @@ class Film:
         self.fps = float(USUAL_FPS)
         self._every, self._seen, self._complete = 1, 0, False
 
-    def filming(self, make: Callable[[int], ContractEnv]) -> Callable[[int], Any]:
-        """`make`, whose environment 0 is filmed."""
-        return lambda index: make(index) if index else _Filmed(make(index), self)
+    def filming(self, make: Callable[[int], Adapted]) -> Callable[[int], Any]:
+        """`make`, whose environment 0 is filmed.
+
+        Raises:
+          UserError: from the result, if it is a vector.
+        """
+
+        def filmed(index: int) -> Any:
+            env = make(index)
+            if isinstance(env, ContractVector):
+                raise UserError(
+                    f"task {env.task} is a vector environment, which cannot be filmed; give --task a function that "
+                    f"returns one of its environments"
+                )
+            return env if index else _Filmed(env, self)
+
+        return filmed
 
     def begin(self) -> None:
         """An episode begins. One that did not come to its end is forgotten."""

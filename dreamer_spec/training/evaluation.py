@@ -77,7 +77,7 @@ def report_failures(envs: Environments, say: Callable[[str], None]) -> None:
 
 
 def report_failure(failure: Failure, say: Callable[[str], None]) -> None:
-    say(f"environment {failure.worker} failed and was restarted ({failure.kind}): {failure.message}")
+    say(f"{failure.who} failed and was restarted ({failure.kind}): {failure.message}")
 
 
 class Agent:

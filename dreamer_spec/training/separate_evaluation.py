@@ -14,7 +14,7 @@ import numpy as np
 from dreamer_spec.backend import Learner
 from dreamer_spec.disk.checkpoint import differences, open_checkpoint, space_entries
 from dreamer_spec.disk.saved_agent import SavedAgent, agent_of
-from dreamer_spec.envs import ContractEnv, Environments, Record, env_maker
+from dreamer_spec.envs import Adapted, Environments, Record, env_maker
 from dreamer_spec.errors import UserError
 from dreamer_spec.monitoring.logger import Display
 from dreamer_spec.monitoring.video import Film
@@ -129,7 +129,7 @@ def evaluate_checkpoint(
     )
     learner_type = import_learner(options.backend)
     film = Film(video) if video else None
-    make_env: Callable[[int], ContractEnv] = env_maker(options, render=film is not None)
+    make_env: Callable[[int], Adapted] = env_maker(options, render=film is not None)
     make_env = film.filming(make_env) if film else make_env
     with ExitStack() as stack:
         display = stack.enter_context(Display(episodes))

@@ -14,7 +14,7 @@ from dreamer_spec.backend import Learner, learner_class
 from dreamer_spec.disk import checkpoint, logdir
 from dreamer_spec.disk.about import About, write_about
 from dreamer_spec.disk.checkpoint import Checkpoint
-from dreamer_spec.envs import ContractEnv, Environments, Record, Trial, doubts, env_maker, try_out
+from dreamer_spec.envs import Adapted, Environments, Record, Trial, doubts, env_maker, try_out
 from dreamer_spec.envs.frames import repeated_twice
 from dreamer_spec.errors import UserError
 from dreamer_spec.monitoring.logger import Display, Logger, Watch
@@ -211,7 +211,7 @@ def import_learner(backend: str) -> type[Learner]:
         ) from error
 
 
-def try_environment(options: Options, make: Callable[[int], ContractEnv], display: Display) -> Trial | None:
+def try_environment(options: Options, make: Callable[[int], Adapted], display: Display) -> Trial | None:
     """What an environment in a process of its own shows; None where none shall have one."""
     if options.processes == "no":
         return None
@@ -234,6 +234,12 @@ def _make_environments(
         return stack.enter_context(closing(made))
 
     envs = several(options.config.envs)
+    if envs.count != options.config.envs:
+        raise UserError(
+            f"task {options.task} is a vector of {counted(envs.count, 'environment')}, and this run is to have "
+            f"{options.config.envs}: add --envs {envs.count}, or give the function an argument num_envs, which gets "
+            f"the number of --envs"
+        )
     if options.eval_env == "shared":
         return envs, envs
     tests = min(envs.count, max(options.eval_episodes, options.random_episodes))
