@@ -66,7 +66,14 @@ def test_every_combination_is_a_run() -> None:
         ({"vary": {"backend": ["jax"], "learning_rat": [1]}}, ["learning_rat", "did you mean learning_rate?"]),
         ({"vary": {"backend": ["jax"], "learning_rate": ["x"]}}, ["learning_rate is 'x'"]),
         ({"vary": {"task": ["gym:A-v0"]}}, ["no backend"]),
-        ({"vary": {"backend": ["jax", "jax"]}}, ["two runs have the name"]),
+        ({"vary": {"backend": ["jax", "jax"]}}, ["2 runs have the name"]),
+        ({"vary": {"backend": ["jax"], "learning-rate": [1]}}, ["learning-rate", "did you mean learning_rate?"]),
+        ({"vary": {"backend": ["jax"], "learning_rate": [-1e-5]}}, ["learning_rate is -1e-05", "0 or more"]),
+        ({"vary": {"backend": ["jax"], "task": ["gym:A\0-v0"]}}, ["gym:A\\x00-v0", "the character 0"]),
+        ({"vary": {"backend": ["jax"], "task": ["gym:" + "a" * 300]}}, ["the name aaa", "at most 200 bytes"]),
+        ({"vary": {"backend": ["jax"], "learning_rate": [1] * 200, "seed": "0-99"}}, ["20,000", "at most 10,000"]),
+        ({"logdir": 3}, ["logdir is 3", "the name of a folder"]),
+        ({"logdir": ""}, ["logdir is ''", "the name of a folder"]),
     ],
 )
 def test_what_is_wrong_in_a_file_is_named(tmp_path: Path, change: dict[str, Any], words: list[str]) -> None:

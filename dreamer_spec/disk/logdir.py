@@ -3,7 +3,7 @@
 import os
 import re
 import secrets
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import filelock
@@ -58,6 +58,15 @@ def hold(logdir: Path, stack: ExitStack) -> None:
         raise UserError(
             f"cannot write to the log directory {logdir}: {error.strerror}; choose another with --logdir"
         ) from error
+
+
+def wait_until_free(logdir: Path, seconds: float) -> None:
+    """Until nobody holds a log directory, or so long. What else is wrong with it, `hold` says."""
+    path = logdir / ".lock"
+    if path.is_symlink() or not path.is_file():
+        return
+    with suppress(filelock.Timeout, NotImplementedError, OSError), filelock.FileLock(path, timeout=seconds):
+        pass
 
 
 def require_free(logdir: Path) -> None:
