@@ -61,12 +61,18 @@ def hold(logdir: Path, stack: ExitStack) -> None:
 
 
 def wait_until_free(logdir: Path, seconds: float) -> None:
-    """Until nobody holds a log directory, or so long. What else is wrong with it, `hold` says."""
+    """Until nobody holds a log directory, or so long; says that it waits. What else is wrong with it, `hold` says."""
     path = logdir / ".lock"
     if path.is_symlink() or not path.is_file():
         return
-    with suppress(filelock.Timeout, NotImplementedError, OSError), filelock.FileLock(path, timeout=seconds):
-        pass
+    lock = filelock.FileLock(path, timeout=0)
+    with suppress(filelock.Timeout, NotImplementedError, OSError):
+        try:
+            lock.acquire()
+        except filelock.Timeout:
+            print(f"waits for another process, which still holds {logdir}", flush=True)
+            lock.acquire(timeout=seconds)
+        lock.release()
 
 
 def require_free(logdir: Path) -> None:
