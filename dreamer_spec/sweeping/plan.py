@@ -130,7 +130,7 @@ def _item(logdir: Path, given: Mapping[str, Any], varied: Mapping[str, Any]) -> 
     name += "".join(f"-{key}={value}".replace("/", "_").replace(" ", "") for key, value in own.items())
     if len(name.encode()) > LONGEST_NAME:
         raise UserError(
-            f"a run would have the name {name:.80}...; expected at most {LONGEST_NAME} bytes: values of [vary] are in it"
+            f"a run would have the name {name:.80}...; expected at most {LONGEST_NAME} bytes: [vary] is part of it"
         )
     command = (*words, "--logdir", str(logdir / name))
     return Item(name, command, dataclasses.replace(options, logdir=logdir / name))
