@@ -1,7 +1,10 @@
 """`train sweep`: what a file describes, who runs it, and what is not run twice."""
 
+import contextlib
+import errno
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -14,6 +17,8 @@ import pytest
 from rich.console import Console
 
 from dreamer_spec.cli import main
+from dreamer_spec.commands.sweep import _last_words
+from dreamer_spec.disk.logdir import hold
 from dreamer_spec.errors import UserError
 from dreamer_spec.sweeping import progress, runner
 from dreamer_spec.sweeping.places import Processes
@@ -66,7 +71,14 @@ def test_every_combination_is_a_run() -> None:
         ({"vary": {"backend": ["jax"], "learning_rat": [1]}}, ["learning_rat", "did you mean learning_rate?"]),
         ({"vary": {"backend": ["jax"], "learning_rate": ["x"]}}, ["learning_rate is 'x'"]),
         ({"vary": {"task": ["gym:A-v0"]}}, ["no backend"]),
-        ({"vary": {"backend": ["jax", "jax"]}}, ["two runs have the name"]),
+        ({"vary": {"backend": ["jax", "jax"]}}, ["2 runs have the name"]),
+        ({"vary": {"backend": ["jax"], "learning-rate": [1]}}, ["learning-rate", "did you mean learning_rate?"]),
+        ({"vary": {"backend": ["jax"], "learning_rate": [-1e-5]}}, ["learning_rate is -1e-05", "0 or more"]),
+        ({"vary": {"backend": ["jax"], "task": ["gym:A\0-v0"]}}, ["gym:A\\x00-v0", "the character 0"]),
+        ({"vary": {"backend": ["jax"], "task": ["gym:" + "a" * 300]}}, ["the name aaa", "at most 200 bytes"]),
+        ({"vary": {"backend": ["jax"], "learning_rate": [1] * 200, "seed": "0-99"}}, ["20,000", "at most 10,000"]),
+        ({"logdir": 3}, ["logdir is 3", "the name of a folder"]),
+        ({"logdir": ""}, ["logdir is ''", "the name of a folder"]),
     ],
 )
 def test_what_is_wrong_in_a_file_is_named(tmp_path: Path, change: dict[str, Any], words: list[str]) -> None:
@@ -200,6 +212,62 @@ def _wait(condition: Any, what: str, seconds: float = 120.0) -> None:
     while not condition():
         assert time.monotonic() < end, f"{what}: not within {seconds} s"
         time.sleep(0.05)
+
+
+def test_a_run_waits_for_the_one_before_it_which_still_saves(tmp_path: Path) -> None:
+    plan = plan_in(tmp_path, "0")
+    item, log, place = plan.items[0], tmp_path / "log", Processes(1)
+    with contextlib.ExitStack() as stack:
+        hold(item.options.logdir, stack)
+        handle = place.start(item.command, log)
+        _wait(lambda: "waits for another process" in log.read_text(), "it says that it waits")
+        assert place.code(handle) is None
+    _wait(lambda: place.code(handle) is not None, "it has ended")
+    assert handle.returncode == 0, log.read_text()
+
+
+def test_a_folder_that_another_sweep_uses_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "a.toml"
+    file.write_text('[options]\nbackend = "torch"\n')
+    with contextlib.ExitStack() as stack:
+        hold(tmp_path / "runs", stack)
+        assert main(["sweep", str(file), "--logdir", str(tmp_path / "runs")]) == 2
+    assert "another process" in capsys.readouterr().err
+    assert not (tmp_path / "runs" / "logs").exists()
+
+
+def test_a_disk_that_refuses_the_note_ends_the_runs_under_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(path: Path) -> Any:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    place = Scripted({})
+    sweep = Sweep(plan_in(tmp_path, "0-4", jobs=3), place)
+    monkeypatch.setattr(runner, "replacing", full)
+    with pytest.raises(UserError, match=r"sweep\.json: No space left"):
+        run(sweep)
+    assert "running" not in [state.phase for state in sweep.states]
+
+
+def test_a_log_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    before = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else None
+    with pytest.raises(UserError, match="cannot write"):
+        Processes(1).start((), tmp_path / "missing" / "log")
+    assert before is None or os.sched_getaffinity(0) == before
+
+
+def test_a_table_fits_into_a_narrow_terminal(tmp_path: Path) -> None:
+    states = Sweep(plan_in(tmp_path, "0-49"), Scripted({})).states
+    with open(tmp_path / "said", "w+") as file:
+        Console(file=file, width=40, force_terminal=True).print(progress.table(states))
+        file.seek(0)
+        lines = file.read().splitlines()
+    assert all(len(re.sub(r"\x1b\[[0-9;]*m", "", line)) <= 40 for line in lines)
+
+
+def test_a_run_without_a_log_said_nothing(tmp_path: Path) -> None:
+    assert _last_words(tmp_path / "log").startswith("it said nothing")
+    (tmp_path / "log").write_bytes(b"first\n" * 20_000 + b"\xfflast\n\n")
+    assert _last_words(tmp_path / "log").startswith("\ufffdlast (")
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="the system gives no process its cores")

@@ -1,6 +1,7 @@
 """`train sweep FILE`: every combination of tasks, seeds and options, some at once, and one page at the end."""
 
 import argparse
+import contextlib
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,12 +9,13 @@ from pathlib import Path
 from rich.console import Console
 
 from dreamer_spec.cli import Parser
+from dreamer_spec.disk.logdir import hold
 from dreamer_spec.errors import UserError
 from dreamer_spec.report import page
 from dreamer_spec.report.runs import find_logdirs, read_run
 from dreamer_spec.sweeping.places import Processes, Ray
 from dreamer_spec.sweeping.plan import Plan, read_plan
-from dreamer_spec.sweeping.progress import shown
+from dreamer_spec.sweeping.progress import last_lines, shown
 from dreamer_spec.sweeping.runner import FAILED, INTERRUPTED, State, Sweep, log_of
 from dreamer_spec.system.signals import stoppable
 from dreamer_spec.words import counted
@@ -49,6 +51,12 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _run(plan: Plan, console: Console) -> int:
+    with contextlib.ExitStack() as stack:
+        hold(plan.logdir, stack)
+        return _run_held(plan, console)
+
+
+def _run_held(plan: Plan, console: Console) -> int:
     sweep = Sweep(plan, Processes(plan.jobs) if plan.ray is None else Ray(plan.ray))
     with stoppable() as signals, signals.polled(), shown(console) as show:
         code = sweep.run(signals, show)
@@ -66,8 +74,8 @@ def _run(plan: Plan, console: Console) -> int:
 
 
 def _last_words(log: Path) -> str:
-    lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-    return f"{lines[-1] if lines else 'it said nothing'} ({log})"
+    lines = [line for line in last_lines(log) if line.strip()]
+    return f"{lines[-1].decode('utf-8', 'replace').strip() if lines else 'it said nothing'} ({log})"
 
 
 def _report(plan: Plan, states: list[State]) -> Path | None:

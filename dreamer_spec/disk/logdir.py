@@ -3,7 +3,7 @@
 import os
 import re
 import secrets
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import filelock
@@ -58,6 +58,21 @@ def hold(logdir: Path, stack: ExitStack) -> None:
         raise UserError(
             f"cannot write to the log directory {logdir}: {error.strerror}; choose another with --logdir"
         ) from error
+
+
+def wait_until_free(logdir: Path, seconds: float) -> None:
+    """Until nobody holds a log directory, or so long; says that it waits. What else is wrong with it, `hold` says."""
+    path = logdir / ".lock"
+    if path.is_symlink() or not path.is_file():
+        return
+    lock = filelock.FileLock(path, timeout=0)
+    with suppress(filelock.Timeout, NotImplementedError, OSError):
+        try:
+            lock.acquire()
+        except filelock.Timeout:
+            print(f"waits for another process, which still holds {logdir}", flush=True)
+            lock.acquire(timeout=seconds)
+        lock.release()
 
 
 def require_free(logdir: Path) -> None:

@@ -2,12 +2,19 @@
 
 Its standard input is a pipe that the sweep holds. When that closes, because the sweep ends or has died, the run ends
 as after a termination signal: with a checkpoint.
+
+The run before it in the same folder may still be at that, if its sweep or its worker was killed: it is waited for.
 """
 
 import os
 import signal
 import sys
 import threading
+from pathlib import Path
+
+from dreamer_spec.disk.logdir import wait_until_free
+
+PATIENCE = 120.0  # seconds for the checkpoint of the run before
 
 
 def end_with(pipe: int) -> None:
@@ -23,6 +30,7 @@ def main() -> None:
         os.dup2(nothing.fileno(), 0)
     os.set_inheritable(pipe, False)
     threading.Thread(target=end_with, args=(pipe,), daemon=True).start()
+    wait_until_free(Path(sys.argv[sys.argv.index("--logdir") + 1]), PATIENCE)
     from dreamer_spec.cli import command
 
     sys.argv = ["train", *sys.argv[1:]]

@@ -1,7 +1,9 @@
 """What a sweep consists of: every combination of what varies, each a run with a command line of its own."""
 
+import collections
 import dataclasses
 import itertools
+import math
 import tomllib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -17,6 +19,8 @@ from dreamer_spec.options import Options, default_logdir, did_you_mean
 
 TABLES = ("logdir", "jobs", "options", "vary", "ray")
 OF_THE_SWEEP = ("logdir", "resume", "seeds")  # options of `train` that a sweep gives its runs itself
+MOST_RUNS = 10_000
+LONGEST_NAME = 200  # bytes of the name of a run; file systems allow 255, with endings
 IN_NAMES = ("backend", "task", "seed")  # part of every name
 
 
@@ -69,12 +73,14 @@ def make_plan(content: Mapping[str, Any], logdir: Path | None = None, jobs: int 
     varied = {name: _values(name, values) for name, values in vary.items()}
     if both := set(given) & set(varied):
         raise UserError(f"{', '.join(sorted(both))} stands in [options] and in [vary]; once is enough")
-    logdir = logdir or Path(content.get("logdir", "runs/sweep"))
+    logdir = logdir or _folder(content.get("logdir", "runs/sweep"))
+    if (count := math.prod(map(len, varied.values()))) > MOST_RUNS:
+        raise UserError(f"[vary] has {count:,} combinations; expected at most {MOST_RUNS:,}")
     combinations = itertools.product(*varied.values())
     items = tuple(_item(logdir, given, dict(zip(varied, values, strict=True))) for values in combinations)
-    names = [item.name for item in items]
-    if twice := next((name for name in names if names.count(name) > 1), None):
-        raise UserError(f"two runs have the name {twice}: their values look alike")
+    for name, times in collections.Counter(item.name for item in items).items():
+        if times > 1:
+            raise UserError(f"{times} runs have the name {name}: their values look alike; each must stand once")
     return Plan(
         logdir, _jobs(content.get("jobs", 1) if jobs is None else jobs), items, ray if "ray" in content else None
     )
@@ -95,6 +101,12 @@ def _values(name: str, values: Any) -> list[Any]:
     return values
 
 
+def _folder(value: Any) -> Path:
+    if not isinstance(value, str) or not value or "\0" in value:
+        raise UserError(f"logdir is {value!r:.80}; expected the name of a folder")
+    return Path(value)
+
+
 def _jobs(value: Any) -> int:
     if not isinstance(value, int) or isinstance(value, bool) or value < 1:
         raise UserError(f"jobs is {value!r:.80}; expected a whole number of at least 1")
@@ -110,10 +122,16 @@ def _item(logdir: Path, given: Mapping[str, Any], varied: Mapping[str, Any]) -> 
     if "backend" not in values:
         raise UserError("no backend: give backend in [options] or in [vary], jax or torch")
     words = [word for name, value in values.items() for word in _words(known[name], value)]
+    if bad := next((word for word in words if "\0" in word), None):
+        raise UserError(f"{bad!r:.80} has the character 0, which no command line can have")
     options = parse(words)
     name = str(default_logdir(options.task, options.backend, options.seed).name)
     own = {key: value for key, value in varied.items() if key not in IN_NAMES}
     name += "".join(f"-{key}={value}".replace("/", "_").replace(" ", "") for key, value in own.items())
+    if len(name.encode()) > LONGEST_NAME:
+        raise UserError(
+            f"a run would have the name {name:.80}...; expected at most {LONGEST_NAME} bytes: [vary] is part of it"
+        )
     command = (*words, "--logdir", str(logdir / name))
     return Item(name, command, dataclasses.replace(options, logdir=logdir / name))
 
@@ -125,9 +143,10 @@ def _words(option: Option, value: Any) -> Iterator[str]:
     elif option.kind is ENV_ARG:
         for word in keywords.write(value):
             yield from (option.flag, word)
+    elif (text := _text(value)).startswith("-"):
+        yield f"{option.flag}={text}"  # in a word of its own it would be an option
     else:
-        yield option.flag
-        yield _text(value)
+        yield from (option.flag, text)
 
 
 def _text(value: Any) -> str:

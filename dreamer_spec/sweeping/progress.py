@@ -13,7 +13,7 @@ from rich.table import Table
 from dreamer_spec.monitoring.outcome import read_outcome
 from dreamer_spec.sweeping.runner import DONE, FAILED, RUNNING, WAITING, State
 
-TAIL = 2**16  # bytes at the end of metrics.jsonl, in which the newest step and return stand
+TAIL = 2**16  # bytes: at the end of metrics.jsonl the newest step and return stand in these
 ROWS = 30  # of the table, the rest is counted
 
 
@@ -58,7 +58,7 @@ def table(states: list[State]) -> Table:
 def newest(logdir: Path) -> tuple[int, float | None]:
     """The step of the last line of metrics, and the newest return of an episode."""
     step, score = 0, None
-    for line in _last_lines(logdir / "metrics.jsonl"):
+    for line in last_lines(logdir / "metrics.jsonl"):
         with contextlib.suppress(ValueError, TypeError, AttributeError):
             entry = json.loads(line)
             step = max(step, int(entry.get("step", 0)))
@@ -66,7 +66,8 @@ def newest(logdir: Path) -> tuple[int, float | None]:
     return step, score
 
 
-def _last_lines(path: Path) -> list[bytes]:
+def last_lines(path: Path) -> list[bytes]:
+    """Those in the last TAIL bytes, the first of which may be cut; none where there is no file."""
     with contextlib.suppress(OSError), open(path, "rb") as file:
         file.seek(max(0, path.stat().st_size - TAIL))
         return file.read().split(b"\n")

@@ -1,5 +1,6 @@
 """Runs what a plan holds, and remembers what has ended: the same command goes on where it was stopped."""
 
+import contextlib
 import dataclasses
 import json
 import time
@@ -9,12 +10,11 @@ from typing import Any
 
 from dreamer_spec.disk.files import Unreadable, read_json, replacing
 from dreamer_spec.errors import UserError, writing
-from dreamer_spec.sweeping.places import Place
+from dreamer_spec.sweeping.places import INTERRUPTED, Place
 from dreamer_spec.sweeping.plan import Item, Plan
 from dreamer_spec.system.signals import Signals
 
 WAITING, RUNNING, DONE, FAILED, STOPPED = "waiting", "running", "done", "failed", "stopped"
-INTERRUPTED = 130  # exit code of a run that was asked to end
 POLL = 0.5  # seconds
 
 
@@ -49,14 +49,24 @@ class Sweep:
         somebody stopped it.
 
         show: is told of the states, twice a second.
+
+        Raises:
+          UserError: the disk refuses a note or a log. The runs under way have ended then, with checkpoints if they
+            could.
         """
-        while any(state.phase in (WAITING, RUNNING) for state in self.states):
-            if signals.received:
-                return self._stop(show)
-            self._start_next()
-            show(self.states)
-            time.sleep(POLL)
-            self._collect()
+        try:
+            while any(state.phase in (WAITING, RUNNING) for state in self.states):
+                if signals.received:
+                    return self._stop(show)
+                self._start_next()
+                show(self.states)
+                time.sleep(POLL)
+                if self._collect():
+                    self._write()
+        except UserError:
+            with contextlib.suppress(UserError):  # the same disk
+                self._stop(show)
+            raise
         show(self.states)
         return 2 if any(state.phase in (FAILED, STOPPED) for state in self.states) else 0
 
@@ -66,22 +76,28 @@ class Sweep:
             state.handle = self._place.start(state.item.command, log_of(self._plan, state.item))
             state.phase = RUNNING
 
-    def _collect(self) -> None:
+    def _collect(self) -> bool:
+        """Whether a run has ended that is to be noted."""
+        noted = False
         for state in self.states:
             if state.phase == RUNNING and (code := self._place.code(state.handle)) is not None:
                 state.code, state.phase = code, {0: DONE, INTERRUPTED: STOPPED}.get(code, FAILED)
                 if state.phase == DONE:
                     self._ended[state.item.name] = list(state.item.command)
-                    self._write()
+                    noted = True
+        return noted
 
     def _stop(self, show: Callable[[list[State]], None]) -> int:
         for state in self.states:
             if state.phase == RUNNING:
                 self._place.end(state.handle)
+        noted = False
         while any(state.phase == RUNNING for state in self.states):
             time.sleep(POLL)
-            self._collect()
+            noted |= self._collect()
             show(self.states)
+        if noted:
+            self._write()
         return INTERRUPTED
 
     def _has_ended(self, item: Item) -> bool:

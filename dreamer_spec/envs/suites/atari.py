@@ -43,6 +43,7 @@ def make(play: Play, **arguments: Any) -> gymnasium.Env[Any, Any]:
             f"paper's games, and {play.suite}:NAME plays every other of the package ale-py"
         )
     rom = roms.get_rom_path(play.name)
+    assert rom is not None, "a known game"
     if ale_py.ALEInterface.isSupportedROM(rom) is None:  # Loading it would exit the process.
         raise UserError(f"task {play.task}: the emulator has no rewards for this game, a game for two")
     return AtariEnv(ale_py.ALEInterface(), rom, play, **{**protocol(play.suite, "paper")["env"], **arguments})
