@@ -1,4 +1,5 @@
-"""The tables of docs/scores.md: what the rows of the paper give, and which windows its curves allow."""
+"""The tables of docs/scores.md: what the rows of the paper give, which windows its curves allow, and settings that it
+prints."""
 
 import json
 from decimal import Decimal
@@ -7,7 +8,7 @@ from typing import Any
 
 from dreamer_spec.scoring.suites import SUMMARIES
 from dreamer_spec.scoring.tables import of_paper
-from spec.paper_scores import PaperTable, paper_tables
+from spec.paper_scores import PaperTable, atari100k_protocols, paper_tables, ppo_settings
 
 CURVES = Path(__file__).resolve().parent / "results" / "paper-windows.json"
 
@@ -70,3 +71,15 @@ def windows() -> tuple[list[str], list[list[str]]]:
         rows.append([*cells, f"{entry['most_equal']} with {reach}"])
     header = ["suite", "method", "runs", "left out", "window", "rows equal in every printed digit"]
     return [*header, "most, with the shortest and the longest window"], rows
+
+
+def atari100k_settings() -> tuple[list[str], list[list[str]]]:
+    """Header and rows: how the protocols for Atari100k differ, a column for each method."""
+    protocols = atari100k_protocols()
+    rows = [[setting.replace("_", " "), *values.values()] for setting, values in protocols.items()]
+    return ["setting", *next(iter(protocols.values()))], rows
+
+
+def ppo_settings_rows() -> tuple[list[str], list[list[str]]]:
+    """Header and rows: the paper's hyperparameters of PPO."""
+    return ["setting", "value"], [[setting, value] for setting, value in ppo_settings().items()]
