@@ -402,6 +402,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "metrics": catalogue.markdown,
     "third_party": third_party.summary_table,
     "third_party_findings": third_party.finding_sections,
+    "scores_bsuite": lambda: markdown_table(*score_tables.published("scores-bsuite")),
     "paper_summaries": lambda: markdown_table(*score_tables.summaries()),
     "paper_windows": lambda: markdown_table(*score_tables.windows()),
     "atari100k_protocols": lambda: markdown_table(*score_tables.atari100k_settings()),

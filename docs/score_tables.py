@@ -10,7 +10,8 @@ from dreamer_spec.scoring.suites import SUMMARIES
 from dreamer_spec.scoring.tables import of_paper
 from spec.paper_scores import PaperTable, atari100k_protocols, paper_tables, ppo_settings
 
-CURVES = Path(__file__).resolve().parent / "results" / "paper-windows.json"
+RESULTS = Path(__file__).resolve().parent / "results"
+CURVES = RESULTS / "paper-windows.json"
 
 
 def summaries() -> tuple[list[str], list[list[str]]]:
@@ -83,3 +84,16 @@ def atari100k_settings() -> tuple[list[str], list[list[str]]]:
 def ppo_settings_rows() -> tuple[list[str], list[list[str]]]:
     """Header and rows: the paper's hyperparameters of PPO."""
     return ["setting", "value"], [[setting, value] for setting, value in ppo_settings().items()]
+
+
+def published(name: str) -> tuple[list[str], list[list[str]]]:
+    """Header and rows: every run in results/NAME.json, which `train score --json` wrote, beside the paper's task."""
+    data = json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))
+    paper = {f"{suite['suite']}:{task['task']}": task["paper"] for suite in data["suites"] for task in suite["tasks"]}
+    rows = []
+    for run in data["runs"]:
+        printed = paper[run["task"].partition("/")[0]]
+        cells = [f"`{run['task']}`", run["backend"], str(run["seed"]), f"{run['step']:,}", f"{run['returns']:,}"]
+        rows.append([*cells, f"{run['score']:.3f}", f"{printed['random']:g}", f"{printed['dreamer']:g}"])
+    header = ["task", "backend", "seed", "steps", "episodes", "score", "random, paper", "Dreamer, paper"]
+    return header, rows
