@@ -130,16 +130,21 @@ def benchmark_table() -> str:
         own = suite.get("env", {})
         return ", ".join(f"`{name}` {cell({**own, 'official': _official_env(suite)}, name)}" for name in own)
 
+    def printed(suite: dict[str, Any], name: str) -> str:
+        return str(suite.get(name, ""))
+
     rows = [
         [
             f"`{name}`" + (", ours" if suite.get("ours") else ""),
             str(len(suite["tasks"])),
             *(cell(suite, column) for column in names),
             arguments(suite),
+            printed(suite, "seeds"),
+            printed(suite, "gpu_days"),
         ]
         for name, suite in benchmarks().items()
     ]
-    return markdown_table(["suite", "tasks", *names, "its environment"], rows)
+    return markdown_table(["suite", "tasks", *names, "its environment", "seeds", "GPU days"], rows)
 
 
 def _official_env(suite: dict[str, Any]) -> dict[str, Any]:
@@ -397,8 +402,11 @@ TABLES: dict[str, Callable[[], str]] = {
     "metrics": catalogue.markdown,
     "third_party": third_party.summary_table,
     "third_party_findings": third_party.finding_sections,
+    "scores_bsuite": lambda: markdown_table(*score_tables.published("scores-bsuite")),
     "paper_summaries": lambda: markdown_table(*score_tables.summaries()),
     "paper_windows": lambda: markdown_table(*score_tables.windows()),
+    "atari100k_protocols": lambda: markdown_table(*score_tables.atari100k_settings()),
+    "ppo": lambda: markdown_table(*score_tables.ppo_settings_rows()),
     "loop_shares": loop_shares,
     "loop_memory": loop_memory,
     "lockstep_free": lambda: lockstep_table("free", ("float64",)),

@@ -1,4 +1,5 @@
-"""The tables of docs/scores.md: what the rows of the paper give, and which windows its curves allow."""
+"""The tables of docs/scores.md: what the rows of the paper give, which windows its curves allow, and settings that it
+prints."""
 
 import json
 from decimal import Decimal
@@ -7,9 +8,10 @@ from typing import Any
 
 from dreamer_spec.scoring.suites import SUMMARIES
 from dreamer_spec.scoring.tables import of_paper
-from spec.paper_scores import PaperTable, paper_tables
+from spec.paper_scores import PaperTable, atari100k_protocols, paper_tables, ppo_settings
 
-CURVES = Path(__file__).resolve().parent / "results" / "paper-windows.json"
+RESULTS = Path(__file__).resolve().parent / "results"
+CURVES = RESULTS / "paper-windows.json"
 
 
 def summaries() -> tuple[list[str], list[list[str]]]:
@@ -70,3 +72,28 @@ def windows() -> tuple[list[str], list[list[str]]]:
         rows.append([*cells, f"{entry['most_equal']} with {reach}"])
     header = ["suite", "method", "runs", "left out", "window", "rows equal in every printed digit"]
     return [*header, "most, with the shortest and the longest window"], rows
+
+
+def atari100k_settings() -> tuple[list[str], list[list[str]]]:
+    """Header and rows: how the protocols for Atari100k differ, a column for each method."""
+    protocols = atari100k_protocols()
+    rows = [[setting.replace("_", " "), *values.values()] for setting, values in protocols.items()]
+    return ["setting", *next(iter(protocols.values()))], rows
+
+
+def ppo_settings_rows() -> tuple[list[str], list[list[str]]]:
+    """Header and rows: the paper's hyperparameters of PPO."""
+    return ["setting", "value"], [[setting, value] for setting, value in ppo_settings().items()]
+
+
+def published(name: str) -> tuple[list[str], list[list[str]]]:
+    """Header and rows: every run in results/NAME.json, which `train score --json` wrote, beside the paper's task."""
+    data = json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))
+    paper = {f"{suite['suite']}:{task['task']}": task["paper"] for suite in data["suites"] for task in suite["tasks"]}
+    rows = []
+    for run in data["runs"]:
+        printed = paper[run["task"].partition("/")[0]]
+        cells = [f"`{run['task']}`", run["backend"], str(run["seed"]), f"{run['step']:,}", f"{run['returns']:,}"]
+        rows.append([*cells, f"{run['score']:.3f}", f"{printed['random']:g}", f"{printed['dreamer']:g}"])
+    header = ["task", "backend", "seed", "steps", "episodes", "score", "random, paper", "Dreamer, paper"]
+    return header, rows

@@ -110,6 +110,11 @@ def atari100k_protocols() -> dict[str, dict[str, str]]:
     return {row.pop("setting"): row for row in read_rows("atari100k-protocols")}
 
 
+def ppo_settings() -> dict[str, str]:
+    """Setting -> value: the table of PPO's hyperparameters, as the paper writes them (D-125)."""
+    return {row["setting"]: row["value"] for row in read_rows("ppo")}
+
+
 def read_rows(name: str) -> list[dict[str, str]]:
     """The rows of scores/NAME.csv by column. Lines that begin with # say where they come from."""
     text = resources.files("spec").joinpath("scores", f"{name}.csv").read_text(encoding="utf-8")

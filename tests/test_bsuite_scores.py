@@ -153,3 +153,16 @@ def test_an_experiment_is_scored_for_each_seed(tmp_path: Path, capsys: pytest.Ca
     assert "not all configurations were run: cartpole 1 of 20, catch 2 of 20" in shown
     assert f"fewer episodes than BSuite's score is made of: {tmp_path / 'cartpole'} (500 of 1,000)" in shown
     assert "the first 10,000 training episodes, scored by bsuite's own rules" in shown
+
+
+def test_a_run_that_is_there_twice_counts_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for number, seed in ((1, 0), (2, 0), (1, 1)):
+        make_run(tmp_path / f"a{number}-{seed}", f"bsuite:catch/{number}", player("catch", number, 0.5), seed)
+    make_run(tmp_path / "b", "bsuite:catch/1", player("catch", 9, 1.0))
+    assert main(["score", str(tmp_path), "--json", str(tmp_path / "scores.json")]) == 0
+    (suite,) = json.loads((tmp_path / "scores.json").read_text())["suites"]
+    both, one = ([player("catch", number, 0.5) for number in numbers] for numbers in ((1, 2), (1,)))
+    assert suite["tasks"][0]["runs"] == pytest.approx([score("catch", both), score("catch", one)])
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "more than one run of bsuite:catch/1 with seed 0, of which the first counts" in shown
+    assert "not every seed has the same configurations: catch" in shown

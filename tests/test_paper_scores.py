@@ -22,6 +22,7 @@ from spec.paper_scores import (
     bsuite_categories,
     minecraft_items,
     paper_tables,
+    ppo_settings,
     read_rows,
     references,
     windows,
@@ -141,6 +142,7 @@ def test_the_tables_are_complete() -> None:
         columns = [method.column for method in table.methods]
         assert all(list(row) == columns for row in (*table.scores.values(), *table.printed.values()))
         assert list(table.scores) == benchmarks()[suite]["tasks"]
+    assert len(ppo_settings()) == 16
     assert len(atari100k_protocols()) == 11
     assert {len(row) for row in atari100k_protocols().values()} == {6}
     assert [row["percent"] for row in minecraft_items()] == ["0.4", "100", "0"]

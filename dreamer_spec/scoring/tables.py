@@ -1,6 +1,5 @@
 """The scores of many runs by suite: a row for each task, summaries of them, and the paper's numbers for the same."""
 
-import collections
 import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -101,22 +100,23 @@ def _task(name: str, scores: Sequence[RunScore], summary: Summary | None, paper:
     return TaskScore(name, runs, values, float(mean), deviation, normalized, paper)
 
 
-def _of_bsuite(experiment: str, runs: Sequence[RunScore]) -> np.ndarray:
-    """[n]: the score of each seed, made of all configurations that were run with it. Another run of the same
-    configuration and seed begins a score of its own."""
-    together: dict[tuple[str, int], list[bsuite.Episodes]] = {}
-    seen: collections.Counter[tuple[str, int]] = collections.Counter()
+def _by_seed(runs: Sequence[RunScore]) -> dict[str, dict[int, bsuite.Episodes]]:
+    """Seed -> number of a configuration -> its episodes; of runs that are there twice the first."""
+    found: dict[str, dict[int, bsuite.Episodes]] = {}
     for run in runs:
         episodes = bsuite.scored(run.run)
         assert episodes is not None, "it has a score"
-        seed = show(run.run.seed)
-        together.setdefault((seed, seen[seed, episodes.number]), []).append(episodes)
-        seen[seed, episodes.number] += 1
-    return np.array([bsuite.score(experiment, episodes) for episodes in together.values()])
+        found.setdefault(show(run.run.seed), {}).setdefault(episodes.number, episodes)
+    return found
+
+
+def _of_bsuite(experiment: str, runs: Sequence[RunScore]) -> np.ndarray:
+    """[n]: the score of each seed, made of all configurations that were run with it."""
+    return np.array([bsuite.score(experiment, list(found.values())) for found in _by_seed(runs).values()])
 
 
 def _configurations(tasks: Sequence[TaskScore]) -> list[str]:
-    """Experiments of which not all configurations were run."""
+    """Experiments of which not all configurations were run, at all or with some seed."""
     known = benchmarks()["bsuite"]["experiments"]
     found = {task.task: len({bsuite.configuration(run.run.task) for run in task.runs}) for task in tasks}
     partly = [
@@ -124,7 +124,9 @@ def _configurations(tasks: Sequence[TaskScore]) -> list[str]:
         for name, count in found.items()
         if count < known[name]["configurations"]
     ]
-    return [f"not all configurations were run: {', '.join(partly)}"] if partly else []
+    notes = [f"not all configurations were run: {', '.join(partly)}"] if partly else []
+    unlike = [task.task for task in tasks if len({frozenset(one) for one in _by_seed(task.runs).values()}) > 1]
+    return notes + ([f"not every seed has the same configurations: {', '.join(unlike)}"] if unlike else [])
 
 
 def _summary(summary: Summary, table: PaperTable, tasks: Sequence[TaskScore], complete: bool) -> SummaryScore:
@@ -165,7 +167,8 @@ def _differences(runs: Sequence[RunLog]) -> list[str]:
         notes.append(f"the runs differ in {name}: {', '.join(value or 'none' for value in values)}")
     pairs = [(run.task, run.seed) for run in runs]
     twice = [f"{task} with seed {seed}" for task, seed in dict.fromkeys(pairs) if pairs.count((task, seed)) > 1]
-    return notes + ([f"more than one run of {', '.join(twice)}"] if twice else [])
+    counted = ", of which the first counts" if not budget else ""
+    return notes + ([f"more than one run of {', '.join(twice)}{counted}"] if twice else [])
 
 
 def _single(tasks: Sequence[TaskScore]) -> list[str]:
