@@ -167,7 +167,8 @@ def test_the_wrapper_of_the_document_gives_a_range(monkeypatch: pytest.MonkeyPat
     monkeypatch.setitem(sys.modules, "my_module", types.ModuleType("my_module"))
     monkeypatch.setitem(gymnasium.registry, "Valve-v0", gymnasium.envs.registration.EnvSpec("Valve-v0", Valve))
     scope: dict[str, Any] = {}
-    exec(blocks("python")[0], scope)
+    (wrapper,) = [block for block in blocks("python") if "def make_env(" in block]
+    exec(wrapper, scope)
     env = ContractEnv(scope["make_env"](), "t")
     assert not [line for line in env.translation.lines if line.startswith("WARNING")]
     assert env.translation.action(F4([1])).tolist() == [40]
