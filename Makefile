@@ -39,7 +39,7 @@ test-newest: .venv-newest/.tested
 	$(@D)/bin/train --backend $(BACKEND) --steps 2000 --logdir $(@D)/run --resume never
 
 # The suites with their packages, those too that the lock cannot hold: sources to be built, and ProcGen, which asks for an older NumPy.
-PROCGEN := $(shell $(PYTHON) -c 'import sys; print("procgen-mirror==0.10.7 gym3==0.3.3 cffi pycparser" if sys.version_info < (3, 13) else "procgen-gym==0.1.1")')
+PROCGEN = $(shell $(PYTHON) -c 'import sys; print("procgen-mirror==0.10.7 gym3==0.3.3 cffi pycparser" if sys.version_info < (3, 13) else "procgen-gym==0.1.1")')
 test-suites: $(UV)
 	$(UV) venv --quiet --clear --python $(PYTHON) .venv-suites
 	$(UV) pip install --quiet --python .venv-suites --override requirements/overrides.txt -e '.[jax,dm-control,atari,bsuite,crafter,minigrid,test]'

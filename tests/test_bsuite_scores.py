@@ -62,9 +62,8 @@ def player(experiment: str, number: int, slow: float) -> Episodes:
     kind = experiment.removesuffix("_noise").removesuffix("_scale")
     values = np.where(bad, *OTHERS.get(kind, BAD_AND_GOOD.get(needed(experiment), (0.0, 0.0))))
     counted = {name: values for name in [needed(experiment)] if name}
-    if kind == "cartpole_swingup":
-        counted = {"raw_return": values}
-    return Episodes(number, np.zeros(count) if needed(experiment) else values, counted)
+    has_no_other = kind in ("cartpole_swingup", "discounting_chain")  # rewards than what is counted
+    return Episodes(number, values if has_no_other else np.zeros(count), counted)
 
 
 def players(experiment: str, slow: float) -> list[Episodes]:

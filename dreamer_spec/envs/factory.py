@@ -108,43 +108,33 @@ def make_env(
     """
     register(registered)
     arguments = arguments or {}
-    if make is not None:
-        called = _call(task, make, render, arguments, num_envs)
-        return _adapted(
-            called, task, index, image_size, action_repeat, time_limit, info_metrics, observations, leave_out
-        )
     suite, separator, name = task.partition(":")
-    if not separator or not suite or not name:
+    env: gymnasium.Env[Any, Any] | VectorEnv[Any, Any, Any]
+    if make is not None:
+        env = _call(task, make, render, arguments, num_envs)
+    elif not separator or not suite or not name:
         raise UserError(f"unknown task {task!r}; expected {EXPECTED}")
-    if suite == "gym":
-        env = _make_gymnasium(task, name, render, arguments, time_limit)
+    elif suite == "gym":
+        env, time_limit = _make_gymnasium(task, name, render, arguments, time_limit), None
     elif suite in SUITES:
         traits = SUITES[suite]
         own_repeat, own_limit = action_repeat if traits.repeats else 1, time_limit if traits.limits else None
         with _naming(task, arguments):
             env = suites.make(suites.Play(suite, name, image_size, own_repeat, own_limit, render), arguments)
-        env = env if traits.limits else _limited(env, time_limit)
+        time_limit = None if traits.limits else time_limit
         action_repeat = 1 if traits.repeats else action_repeat
     else:
-        called = _call(task, _find_own(task, suite, name), render, arguments, num_envs)
-        return _adapted(
-            called, task, index, image_size, action_repeat, time_limit, info_metrics, observations, leave_out
-        )
-    return ContractEnv(env, task, index, image_size, action_repeat, info_metrics, observations, leave_out)
+        env = _call(task, _find_own(task, suite, name), render, arguments, num_envs)
+    choice = info_metrics, observations, leave_out
+    if isinstance(env, VectorEnv):
+        _refuse_wrapping(task, action_repeat, time_limit)
+        return ContractVector(env, task, image_size, *choice)
+    if time_limit:
+        env = gymnasium.wrappers.TimeLimit(env, time_limit)
+    return ContractEnv(env, task, index, image_size, action_repeat, *choice)
 
 
-def _adapted(
-    env: gymnasium.Env[Any, Any] | VectorEnv[Any, Any, Any],
-    task: str,
-    index: int,
-    image_size: int,
-    action_repeat: int,
-    time_limit: int | None,
-    *choice: Sequence[str],
-) -> Adapted:
-    """What a callable has returned, adapted. choice: info_metrics, observations, leave_out."""
-    if not isinstance(env, VectorEnv):
-        return ContractEnv(_limited(env, time_limit), task, index, image_size, action_repeat, *choice)
+def _refuse_wrapping(task: str, action_repeat: int, time_limit: int | None) -> None:
     given = {"--action-repeat": action_repeat if action_repeat != 1 else None, "--time-limit": time_limit}
     for option, value in given.items():
         if value:
@@ -153,11 +143,6 @@ def _adapted(
                 f"{option} {value}, and apply it inside the vector, such as by an argument (--env-arg) or in the "
                 f"functions that make its environments"
             )
-    return ContractVector(env, task, image_size, *choice)
-
-
-def _limited(env: gymnasium.Env[Any, Any], time_limit: int | None) -> gymnasium.Env[Any, Any]:
-    return gymnasium.wrappers.TimeLimit(env, time_limit) if time_limit else env
 
 
 def _make_gymnasium(

@@ -27,6 +27,15 @@ BASE_REGRET = {
     "mnist": 1.8,
     "mountain_car": 1000,
 }
+# What the package counts for a score, where it is not the regret; nothing where returns tell it.
+NEEDED = {
+    "cartpole": "raw_return",
+    "cartpole_swingup": "raw_return",
+    "mountain_car": "raw_return",
+    "memory": "total_perfect",
+    "deep_sea": "total_bad_episodes",
+    "discounting_chain": "",
+}
 GOOD_EPISODE = {"cartpole": 500, "cartpole_swingup": 100}  # the return that counts as solved
 MOUNTAIN_CAR_BEST = -100.0  # the return that has no regret
 UMBRELLA_REGRET = 0.5  # below which an umbrella is learned
@@ -79,12 +88,7 @@ def counted_by_the_package(run: RunLog) -> dict[str, np.ndarray]:
 
 def needed(experiment: str) -> str:
     """The name of what the package counts for the score; empty if returns tell it."""
-    kind = _kind(experiment)
-    if kind in ("discounting_chain", "cartpole_swingup"):
-        return ""
-    if kind in ("cartpole", "mountain_car"):
-        return "raw_return"
-    return {"memory": "total_perfect", "deep_sea": "total_bad_episodes"}.get(kind, "total_regret")
+    return NEEDED.get(_kind(experiment), "total_regret")
 
 
 def scored(run: RunLog) -> Episodes | None:
@@ -127,10 +131,10 @@ def _score(experiment: str, runs: Sequence[Episodes]) -> float:
             return _regret(kind, [MOUNTAIN_CAR_BEST - run.mean("raw_return") for run in runs])
         case "cartpole":
             regret = _regret(kind, [BASE_REGRET[kind] - run.mean("raw_return") for run in runs])
-            return (regret + _share(np.max(run.counted["raw_return"]) > GOOD_EPISODE[kind] for run in runs)) / 2
+            return (regret + _share(_is_solved(kind, run) for run in runs)) / 2
         case "cartpole_swingup":  # each configuration, a height of its own, for itself
-            regrets = [_regret(kind, [BASE_REGRET[kind] - float(np.mean(run.returns))]) for run in runs]
-            return (float(np.mean(regrets)) + _share(np.max(run.returns) > GOOD_EPISODE[kind] for run in runs)) / 2
+            regrets = [_regret(kind, [BASE_REGRET[kind] - run.mean("raw_return")]) for run in runs]
+            return (float(np.mean(regrets)) + _share(_is_solved(kind, run) for run in runs)) / 2
         case "mnist":
             regret = _regret(kind, [run.mean("total_regret") for run in runs])
             return (regret + float(np.mean([_accuracy(run.counted["total_regret"]) for run in runs]))) / 2
@@ -143,6 +147,10 @@ def _score(experiment: str, runs: Sequence[Episodes]) -> float:
             return _share(run.mean("total_regret") < UMBRELLA_REGRET for run in runs)
         case _:
             return _share(_beats_chance(experiment, run) for run in runs)
+
+
+def _is_solved(kind: str, run: Episodes) -> bool:
+    return bool(np.max(run.counted["raw_return"]) > GOOD_EPISODE[kind])
 
 
 def _regret(kind: str, regrets: Sequence[float]) -> float:
